@@ -3,6 +3,8 @@
     python benchmarks/formats_table.py                                            # demo, preset quick, CPU
     python benchmarks/formats_table.py DATA/fox:images_2 DATA/room --device cuda --steps 7000 --out out/formats
 
+A scene is FOLDER[:PICTURES], FAMILY:FOLDER[:PICTURES] or demo.
+
 Every row is a `sw run`: encoded, decoded in a fresh process, evaluated on the test views. 3DGS r1 to r6 and the formats
 encode the same Gaussians; LightGaussian prunes and distils them; ChimeraGS trains its own, taught by them. --steps
 scales all plans by the same factor. Finished runs are not done again. Bytes are those of the .swz; those of a format's
@@ -20,6 +22,10 @@ import subprocess
 import sys
 from pathlib import Path
 from typing import Any
+
+from scene_names import FORMS, split_scene
+
+from splatwizard_core.plugins import load_plugins
 
 SW = [sys.executable, "-m", "splatwizard_core"]
 FORMATS = ("spz", "sog", "compressed-ply", "splat")
@@ -39,7 +45,7 @@ def run(scene: str, methods: str, steps: int | None, rates: str, shared: list[st
     shared  words of the command line that are those of all methods
     """
     starts, full = PLANS[methods]
-    path, _, images = scene.partition(":")
+    path, images = split_scene(scene, load_plugins())
     own_rates = rates if methods in ("lightgaussian", "chimerags") else "all"
     words = ["run", "--method", methods, "--rate", own_rates, "--scene", path, *shared]
     words += ["--images", images] if images else []
@@ -83,7 +89,7 @@ def print_table(found: list[dict[str, Any]]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", nargs="*", default=["demo"], help="PATH or PATH:IMAGES (default: demo)")
+    parser.add_argument("scenes", nargs="*", default=["demo"], metavar="SCENE", help=f"{FORMS} (default: demo)")
     parser.add_argument("--out", type=Path, default=Path("out/formats"), help="root of the run directories")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default: auto)")
     parser.add_argument("--preset", help="of all methods (default: quick on demo, else paper)")

@@ -5,6 +5,8 @@
     python benchmarks/results_matrix.py out/tiny --preset quick --scenes demo:tiny --methods 3dgs,lightgaussian
     python tools/results.py collect out/h200          # small records into docs/records, and the tables
 
+A scene is FOLDER[:PICTURES], FAMILY:FOLDER[:PICTURES] or demo.
+
 A run is `sw run` into OUT/seed-N/<scene>/<method>/<rate>, one of a variant (`3dgs:mcmc`: method and preset) into
 OUT/seed-N-mcmc/... . What is finished is skipped, what was interrupted goes on from its checkpoint: the same command
 continues. The trained 3DGS scene that methods start from is that seed's run of 3dgs, so those methods wait for it;
@@ -31,6 +33,8 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+
+from scene_names import FORMS, split_scene
 
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.plugins.manager import load_plugins
@@ -90,14 +94,8 @@ class Job:
 
 
 def scene_name(scene: str) -> str:
-    """Name of a scene's folder below --out: that of its folder; demo:tiny is demo-tiny."""
-    return scene.replace(":", "-") if scene.startswith("demo") else Path(scene).name
-
-
-def parse_scene(text: str) -> tuple[str, str]:
-    """Split SCENE[:PICTURES]; demo:tiny is a scene, and so is FAMILY:FOLDER."""
-    scene, _, images = ("demo", "", "") if text == "demo" else text.rpartition(":")
-    return (text, "") if not scene or scene.startswith("demo") or "/" in images else (scene, images)
+    """Name of a scene's folder below --out, as `sw run` makes it; demo:tiny is demo-tiny."""
+    return Path(scene).name.replace(":", "-")
 
 
 def asked(text: str) -> tuple[str, str, str]:
@@ -113,7 +111,7 @@ def jobs(args: argparse.Namespace, plugins: PluginManager) -> list[Job]:
     methods = [asked(text) for text in args.methods.split(",")]
     plain = {method for method, variant, _ in methods if not variant}
     for seed in map(int, args.seeds.split(",")):
-        for scene, images in map(parse_scene, args.scenes.split(",")):
+        for scene, images in (split_scene(text, plugins) for text in args.scenes.split(",")):
             for method, variant, own in methods:
                 cls = plugins.methods.load(method)
                 bases = named_scenes(cls(plugins, cls.Config()))
@@ -278,7 +276,7 @@ def _update(path: Path, facts: dict[str, object]) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path, help="where the runs are kept")
-    parser.add_argument("--scenes", required=True, help="comma list of SCENE[:PICTURES], as --scene and --images")
+    parser.add_argument("--scenes", required=True, help=f"comma list; each is {FORMS}")
     parser.add_argument(
         "--methods", default=METHODS, help=f"comma list of METHOD[:PRESET][@RATE+RATE...] (default: {METHODS})"
     )

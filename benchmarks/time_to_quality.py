@@ -3,10 +3,11 @@
     python benchmarks/time_to_quality.py DATA/room DATA/fox DATA/lego --seeds 0,1,2 --out out/quality.jsonl
     python benchmarks/time_to_quality.py DATA/fox:images_2 --parts --iterations 3000 --device cpu --out out/parts.jsonl
 
-A scene is FOLDER[:PICTURES]. Seconds are those of the training loop: statistics, sorting, resizing and spectra count,
-reading pictures, evaluation and checkpoints do not. `CPU s` are those of all threads, with reading pictures and without
-evaluation: on a CPU that is shared they tell more. PSNR and SSIM are means over the held-out views, peak MiB that of
-torch's allocator on a GPU, else of the process. Several seeds are given as mean and half the spread.
+A scene is FOLDER[:PICTURES], FAMILY:FOLDER[:PICTURES] or demo. Seconds are those of the training
+loop: statistics, sorting, resizing and spectra count, reading pictures, evaluation and checkpoints do not. `CPU s` are
+those of all threads, with reading pictures and without evaluation: on a CPU that is shared they tell more. PSNR and
+SSIM are means over the held-out views, peak MiB that of torch's allocator on a GPU, else of the process. Several seeds
+are given as mean and half the spread.
 
 --parts     also the last of the presets with each of its parts left out
 --also      a further variant, NAME=PRESET,KEY=VALUE,KEY=VALUE
@@ -32,6 +33,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from scene_names import FORMS, split_scene
 from train_cuda import theirs
 
 from splatwizard_core.evaluation.evaluate import evaluate
@@ -91,7 +93,7 @@ class Job:
 def trained(job: Job) -> dict[str, Any]:
     """Train and evaluate; the figures."""
     plugins = load_plugins()
-    folder, _, pictures = job.scene.partition(":")
+    folder, pictures = split_scene(job.scene, plugins)
     sets: dict[str, Any] = {**job.variant.sets, "seed": job.seed, "device": job.device, "threads": job.threads}
     if pictures:
         sets["images"] = pictures
@@ -148,7 +150,7 @@ def trained(job: Job) -> dict[str, Any]:
 
 def trained_by_gsplat(job: Job) -> dict[str, Any] | None:
     """Figures of gsplat's trainer, or None with the reason on stderr."""
-    folder, _, pictures = job.scene.partition(":")
+    folder, pictures = split_scene(job.scene, load_plugins())
     args = argparse.Namespace(seed=job.seed, iterations=job.iterations or 30_000, surfels=None, distortion=0.0)
     found = theirs(folder, pictures or None, args)
     if isinstance(found, str):
@@ -292,7 +294,7 @@ def _close_after(group: Sequence[Mapping[str, Any]], wanted: float) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", nargs="+", metavar="FOLDER[:PICTURES]")
+    parser.add_argument("scenes", nargs="+", metavar="SCENE", help=FORMS)
     parser.add_argument("--presets", default="paper,fast", help="comma list (default: paper,fast)")
     parser.add_argument("--parts", action="store_true", help="also the last preset without each of its parts")
     parser.add_argument(

@@ -7,12 +7,13 @@
     python benchmarks/train_anchors.py ../shared/data/room --device cuda --methods hac,cat-3dgs,hac-plus \
         --fused off,on --iterations 1000 --last --baseline-steps 0
 
-A scene is FOLDER[:PICTURES] or demo. The plan of the preset is scaled to --iterations (default: as the preset has it).
-Iterations a second count all steps of a phase but those that are profiled, growth and pruning included. In the middle
-of each phase a window of steps is watched by torch.profiler: what share of a step's time on the host, and on the GPU,
-goes into which part, forward and backward together (a backward operator counts where its forward one ran); operators
-and kernels launched; and how often the host waits for the GPU (on a CPU: operators that would make it wait). The
-profiler slows the host down: shares are those of a profiled step. --syncs lists the lines that wait (CUDA only).
+A scene is FOLDER[:PICTURES], FAMILY:FOLDER[:PICTURES] or demo. The plan of the preset is scaled to --iterations
+(default: as the preset has it). Iterations a second count all steps of a phase but those that are profiled, growth and
+pruning included. In the middle of each phase a window of steps is watched by torch.profiler: what share of a step's
+time on the host, and on the GPU, goes into which part, forward and backward together (a backward operator counts where
+its forward one ran); operators and kernels launched; and how often the host waits for the GPU (on a CPU: operators that
+would make it wait). The profiler slows the host down: shares are those of a profiled step. --syncs lists the lines that
+wait (CUDA only).
 --graphs on,off trains twice, with the decoding as CUDA graphs and without, and prints both with the loss at the end.
 --fused off,on trains twice, without and with the kernels for rows and networks of anchors, bits and lookups of planes.
 Rows at the end compare the last phase of all trainings: steps a second of all of it and of its second quarter
@@ -45,6 +46,7 @@ os.environ.setdefault("DISABLE_CUPTI_LAZY_REINIT", "1")
 os.environ.setdefault("TEARDOWN_CUPTI", "0")
 
 import torch
+from scene_names import FORMS, split_scene
 from step_parts import SECTION, kernel_times, longest_kernels, report
 from sw_anchors import fused_ops, mixture_bits, view_networks
 from torch.profiler import ProfilerActivity, profile, record_function
@@ -403,7 +405,7 @@ def explicit(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", nargs="+", metavar="FOLDER[:PICTURES]|demo")
+    parser.add_argument("scenes", nargs="+", metavar="SCENE", help=FORMS)
     parser.add_argument("--methods", default="hac,cat-3dgs")
     parser.add_argument("--preset", default="paper")
     parser.add_argument("--iterations", type=int, default=0, help="default: those of the preset")
@@ -426,7 +428,7 @@ def main() -> None:
     print(f"{where}, torch {torch.__version__}")
     scenes: dict[tuple[str, str], Scene] = {}
     for asked in args.scenes:
-        folder, _, pictures = asked.partition(":")
+        folder, pictures = split_scene(asked, session.plugins)
         print(asked)
         rows: list[tuple[str, Summary]] = []
         for method in args.methods.split(","):

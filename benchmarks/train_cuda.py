@@ -4,8 +4,8 @@
 
     python benchmarks/train_cuda.py DATA/room DATA/fox:images_2 --surfels 1000 --distortion 10 --iterations 5000
 
-A scene is FOLDER[:PICTURES]. Where gsplat cannot be imported, only ours is measured. Its trainer is train_gsplat.py
-beside this file, which says what SSIM and which opacity reset it has.
+A scene is FOLDER[:PICTURES], FAMILY:FOLDER[:PICTURES] or demo. Where gsplat cannot be imported, only
+ours is measured. Its trainer is train_gsplat.py beside this file, which says what SSIM and which opacity reset it has.
 
 One after the other, so that nothing shares the GPU. Iterations a second count the loop alone, densification included,
 as both trainers report it; PSNR is the mean over the held-out views, memory the peak of torch's allocator in the loop.
@@ -35,6 +35,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from scene_names import FORMS, split_scene
 from torch.profiler import ProfilerActivity, profile
 
 from splatwizard_core.evaluation.evaluate import evaluate
@@ -193,7 +194,7 @@ def theirs(folder: str, pictures: str | None, args: argparse.Namespace) -> Figur
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", nargs="+", metavar="FOLDER[:PICTURES]")
+    parser.add_argument("scenes", nargs="+", metavar="SCENE", help=FORMS)
     parser.add_argument("--iterations", type=int, default=7000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--surfels", type=int, metavar="STEP", help="2DGS, losses of the surface after STEP")
@@ -206,12 +207,13 @@ def main() -> None:
     print(device_reason("cuda", torch.device("cuda"), load_plugins()))
     ratios = []
     for asked in args.scenes:
-        folder, _, pictures = asked.partition(":")
-        mine = ours(folder, pictures or None, args, None)
-        name = f"{Path(folder).name} {pictures}".strip()
+        scene, pictures = split_scene(asked, load_plugins())
+        mine = ours(scene, pictures or None, args, None)
+        family, colon, folder = scene.rpartition(":")
+        name = f"{family}{colon}{Path(folder).name} {pictures}".strip()  # read as another family, it is another scene
         print(f"{name:16} {'it/s':>7} {'PSNR':>7} {'Gaussians':>10} {'peak MiB':>9}")
         print(_row("ours", mine))
-        other = theirs(folder, pictures or None, args)
+        other = theirs(scene, pictures or None, args)
         if isinstance(other, str):
             print(f"  gsplat: not measured, {other}")
         else:
@@ -229,7 +231,7 @@ def main() -> None:
         if args.profile:
             last = args.iterations - 2 * WINDOW - 10
             watch = Watch(tuple(step for step in (1010, args.iterations // 2 + 10, last) if step > 0))
-            ours(folder, pictures or None, args, watch)
+            ours(scene, pictures or None, args, watch)
             print("\n".join(watch.lines), flush=True)
     if ratios:
         print(f"iterations/s over gsplat's, geometric mean of {len(ratios)}: {statistics.geometric_mean(ratios):.2f}")

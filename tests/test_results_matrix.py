@@ -16,6 +16,7 @@ SCRIPT = Path(__file__).parents[1] / "benchmarks" / "results_matrix.py"
 
 @pytest.fixture
 def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(SCRIPT.parent))
     spec = importlib.util.spec_from_file_location("results_matrix", SCRIPT)
     assert spec is not None
     assert spec.loader is not None
@@ -111,12 +112,12 @@ def test_after_the_deadline_nothing_begins(start, capsys):
     assert "no time for 2 runs" in capsys.readouterr().out
 
 
-def test_scenes_with_and_without_pictures(script):
-    assert script.parse_scene("data/fox:images_2") == ("data/fox", "images_2")
-    assert script.parse_scene("data/lego") == ("data/lego", "")
-    assert script.parse_scene("nerf_synthetic:data/lego") == ("nerf_synthetic:data/lego", "")
-    assert script.parse_scene("demo:tiny") == ("demo:tiny", "")
-    assert script.parse_scene("demo") == ("demo", "")
+@pytest.mark.parametrize(
+    ("scene", "folder"),
+    [("demo:tiny", "demo-tiny"), ("data/fox", "fox"), ("nerf_synthetic:data/lego", "lego"), ("demos/fox", "fox")],
+)
+def test_runs_are_looked_for_where_sw_run_puts_them(script, scene, folder):
+    assert script.scene_name(scene) == folder
 
 
 def test_an_interrupted_process_is_given_time_for_its_checkpoint(script, monkeypatch, tmp_path):

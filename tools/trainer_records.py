@@ -18,7 +18,8 @@ class Training:
     """Facts of one training; benchmarks/train_cuda.py --records writes them.
 
     trainer         "splatwizard", or another's name and version
-    scene, plan     folder's name and picture folder; "3dgs" (default density control) or "mcmc"
+    scene, plan     folder's name (FAMILY:name where that was asked for) and picture folder; "3dgs" (default density
+                    control) or "mcmc"
     per_second      steps a second of the loop; None where other work was on the GPU
     gaussians       at the end; None: not counted
     peak_mib        peak of torch's allocator in the loop; None: not measured
