@@ -30,14 +30,13 @@ from rich.console import Console
 from rich.table import Table
 from sw_report.facts import RunFacts, read_facts
 from sw_report.published import FILE as ROWS
-from sw_report.published import Figure, differences, read_published
+from sw_report.published import Figure, differences, read_published, standing_for
 
 from splatwizard_core.api import UserInputError
 
 FIGURES = ("psnr", "ssim", "lpips", "bytes", "gaussians")
 METRICS = {"psnr": "psnr", "ssim": "ssim", "lpips": "lpips_vgg_3dgs"}
 LAYOUTS = {"nerf_synthetic": "blender"}  # data set -> as what a scene of it in a folder of its own is read
-OTHERWISE = "paper"  # preset of runs that stand for a row whose own preset nobody ran
 DIGITS = {"psnr": 2, "ssim": 4, "lpips": 4, "bytes": 0, "gaussians": 0, "steps": 0}
 
 
@@ -124,12 +123,11 @@ def measured(row: Row, out: Path, others: Sequence[RunFacts]) -> list[RunFacts]:
     if own.is_file() and (found := records([own])):
         return found
     of = row.figure
-    fitting = [
+    return standing_for(row.preset, [
         run for run in others
         if (run.method, run.rate, run.scene) == (of.method, row.rate, row.scene.replace(":", "-"))
         and run.dataset in (of.dataset, LAYOUTS.get(of.dataset))
-    ]  # fmt: skip
-    return [r for r in fitting if r.preset == row.preset] or [r for r in fitting if r.preset == OTHERWISE]
+    ])  # fmt: skip
 
 
 def mean(runs: Sequence[RunFacts], figure: str) -> float | None:

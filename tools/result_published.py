@@ -11,10 +11,9 @@ from pathlib import Path
 
 from result_groups import BASE, NONE, TITLES, Rows, points, spread
 from result_records import FROM, RECORDS, SmallRecord, read
-from sw_report.published import Figure, read_published
+from sw_report.published import Figure, read_published, standing_for
 
 FULL_SCENES = {"lego": "nerf_synthetic"}  # scene of the records -> data set whose scene of that name it is made from
-OTHERWISE = "paper"
 HEAD = (
     "method", "rate", "PSNR dB, published", "here", "SSIM, published", "here", "bytes, published", "here",
     "Gaussians, published", "here", "n", "source", "differs besides",
@@ -39,11 +38,7 @@ def _group(figure: Figure, records: Rows) -> Rows:
     groups = points([
         r for r in records if (r.method, r.rate) == (figure.method, figure.rate) and FROM not in r.variant
     ])  # fmt: skip
-    for preset in (figure.preset, OTHERWISE):
-        found = [r for group in groups for r in group if r.preset == preset]
-        if found:
-            return found
-    return []
+    return standing_for(figure.preset, [r for group in groups for r in group])
 
 
 def _row(figure: Figure, group: Rows, records: Rows) -> list[str]:

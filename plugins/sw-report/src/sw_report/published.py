@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -19,6 +19,16 @@ from sw_report.numbers import FIELD_LPIPS, count
 FILE = Path(__file__).with_name("published.json")
 METRICS: Mapping[str, str] = {"psnr": "psnr", "ssim": "ssim", "lpips": FIELD_LPIPS}
 """Figure -> the metric of ours that computes it as the published one."""
+OTHERWISE = "paper"
+"""Preset of the runs that stand for a figure whose own preset nobody ran."""
+
+
+class HasPreset(Protocol):
+    @property
+    def preset(self) -> str | None: ...
+
+
+Run = TypeVar("Run", bound=HasPreset)
 
 
 class Strict(BaseModel):
@@ -117,6 +127,11 @@ def beside(facts: RunFacts, scene: str | None, figures: Sequence[Figure]) -> lis
     of_method = [f for f in figures if (f.method, f.dataset, f.scene) == (facts.method, facts.dataset, scene)]
     same = [f for f in of_method if f.rate is not None and f.rate == facts.rate]
     return [Beside(f, bool(same), tuple(differences(facts, f))) for f in same or of_method]
+
+
+def standing_for(preset: str | None, runs: Sequence[Run]) -> list[Run]:
+    """Select of a figure's runs those of the preset that it is to be measured by, else those of `paper`."""
+    return [run for run in runs if run.preset == preset] or [run for run in runs if run.preset == OTHERWISE]
 
 
 def differences(facts: RunFacts, figure: Figure) -> list[str]:
