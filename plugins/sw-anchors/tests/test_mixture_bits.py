@@ -191,6 +191,26 @@ def test_networks_that_see_another_context_are_refused():
         ChannelNetworks(ChannelMixture([2, 2], context=5), torch.device("cpu"))
 
 
+@pytest.mark.parametrize(
+    ("features", "device", "said"), [(4, "cpu", "4 channels on cpu"), (5, "meta", "5 channels on meta")]
+)
+def test_networks_of_other_channels_or_on_another_device_are_refused(features, device, said):
+    *tensors, counted, units = sample_of(6, 5, 2)
+    channel = ChannelMixture([2, features - 2], context=3 * features)
+    networks, parameters = ChannelNetworks(channel, torch.device(device)), tuple(ChannelNetworks.parameters(channel))
+    predicted = Predicted(units, 0.8, 1e-6, SMALLEST_SCALE, 0.0, MaskKind.GATED)
+    with pytest.raises(ValueError, match=f"networks of {said} are not for 5 features on cpu"):
+        mixture_bits(*tensors, counted, predicted, networks, parameters)
+
+
+@pytest.mark.parametrize("starts", [(0, 1), (1, 2)])
+def test_slices_that_leave_a_channel_out_are_refused(starts):
+    channel = ChannelMixture([2, 2], context=0)
+    channel.starts = starts
+    with pytest.raises(ValueError, match=r"slices \[2, 2\] at \[., .\] are not the channels, each once"):
+        ChannelNetworks(channel, torch.device("cpu"))
+
+
 @pytest.mark.parametrize("change", ["outputs", "units", "kind"])
 def test_tensors_of_wrong_sizes_are_refused(change):
     x, outputs, steps, masks, counted, units = sample_of(5, 4, 2)

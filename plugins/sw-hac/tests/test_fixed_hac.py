@@ -7,9 +7,9 @@ import pytest
 import torch
 from hac_models import make
 from sw_anchors.coded_anchors import ENTROPY, FULL, QUANTIZED
-from sw_anchors.expected_rows import ExpectedRows
-from sw_anchors.fixed_decoder import FixedDecoder, capacity_of
+from sw_anchors.fixed_decoder import FixedDecoder
 from sw_anchors.fixed_step import FixedRows, sample_capacity, sample_of
+from sw_anchors.seen_rows import ExpectedRows, SeenRows, capacity_of
 from sw_anchors.testing import check_fixed_decoder
 from sw_reference.testing.raster_scenes import front_camera
 
@@ -138,6 +138,23 @@ def test_a_view_that_comes_again_is_decoded_before_its_anchors_are_counted():
     check_views_that_come_again("cpu", graphs=False)
 
 
+@pytest.mark.parametrize("seen", [100, 300])
+def test_a_view_that_comes_again_is_decoded_though_graphs_are_refused_by_then(seen, monkeypatch):
+    """300 anchors have no place in what 100 let expect."""
+
+    def refuse(*_):
+        raise RuntimeError("out of memory")
+
+    model, camera = trained().train(), front_camera()
+    model.phase, model.fixed = FULL, FixedDecoder(graphs=False)
+    model.gaussians(camera, Seen(range(100)))
+    model.fixed._drop()
+    monkeypatch.setattr("sw_anchors.fixed_decoder.PlainStep", refuse)
+    assert model.fixed.expected(camera, N) == 256
+    assert sorted(model.gaussians(camera, Seen(range(seen))).extras["anchors"].rows.tolist()) == list(range(seen))
+    assert model.fixed.expected(camera, N) is None
+
+
 def test_anchors_are_expected_in_proportion_to_how_many_there_are():
     model, camera, fixed = trained().train(), front_camera(), FixedDecoder(graphs=False)
     model.fixed = fixed
@@ -180,10 +197,29 @@ def test_rows_beyond_the_places_are_left_out_and_told(seen):
     order = torch.randperm(50, generator=torch.Generator().manual_seed(0))
     mask = torch.zeros(50, dtype=torch.bool)
     mask[torch.randperm(50, generator=torch.Generator().manual_seed(1))[:seen]] = True
-    rows = ExpectedRows(order, mask, 10)
-    assert rows.number() == int(rows.count) == seen
-    assert rows.rows.tolist() == (order[mask].tolist() + [0] * 10)[:10]
+    rows, count = ExpectedRows(order, mask, 10), torch.zeros(())
+    rows.write_number(count)
+    assert rows.number() == int(count) == seen
+    assert rows.loaded.tolist() == (order[mask].tolist() + [0] * 10)[:10]
+    assert torch.equal(rows.placed(), order[mask][:10])
     assert torch.equal(rows.known(), order[mask])
+    assert rows.fit() == (seen < 10)
+
+
+@pytest.mark.parametrize("seen", [0, 1, 255, 256])
+def test_rows_that_are_known_and_those_that_are_found_answer_alike(seen):
+    mask = torch.zeros(400, dtype=torch.bool)
+    mask[torch.randperm(400, generator=torch.Generator().manual_seed(1))[:seen]] = True
+    wanted, count = torch.nonzero(mask).squeeze(1), torch.zeros(())
+    known = SeenRows(wanted)
+    for rows in (known, ExpectedRows(torch.arange(400), mask, known.capacity)):
+        assert rows.capacity == capacity_of(seen)
+        assert torch.equal(rows.known(), wanted)
+        assert torch.equal(rows.placed(), wanted)
+        assert torch.equal(rows.loaded[:seen], wanted)
+        assert rows.fit()
+        rows.write_number(count.fill_(-1))
+        assert count == seen
 
 
 def test_random_draws_are_centred_and_new_at_each_step():
@@ -262,7 +298,7 @@ def test_graphs_of_a_view_that_comes_again_wait_for_no_count():
     finally:
         torch.cuda.set_sync_debug_mode("default")
     assert rows.number() == 334
-    assert rows.rows[:334].tolist() == list(range(0, 1000, 3))
+    assert rows.loaded[:334].tolist() == list(range(0, 1000, 3))
 
 
 @pytest.mark.cuda

@@ -98,6 +98,18 @@ def test_scalars_are_read_in_their_order():
     assert not Verdict([torch.tensor(1.0), torch.tensor(float("inf"))]).fine()
 
 
+@pytest.mark.cuda
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs a GPU that is not the current one")
+def test_a_verdict_is_waited_for_on_the_device_of_the_losses():
+    losses, stream = [torch.ones((), device="cuda:1")], torch.cuda.current_stream("cuda:1")
+    assert Verdict(losses).fine()  # memory of the host is set aside before
+    with torch.cuda.device(1):
+        torch.cuda._sleep(1_000_000_000)
+        slept = stream.record_event()
+    assert Verdict(losses).fine()
+    assert slept.query()
+
+
 @pytest.mark.parametrize("where", ["loss", "task"])
 def test_out_of_memory_names_the_figures_and_leaves_the_run_resumable(toy, tmp_path, where):
     class Fails(toy.Stage):

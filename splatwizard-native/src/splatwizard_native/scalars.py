@@ -26,10 +26,12 @@ class Verdict:
         fine = torch.stack([total.detach().reshape(()) for total in totals]).isfinite().all()
         self._event: torch.cuda.Event | None = None
         if fine.is_cuda:
+            # Of its own device: another may be the current one, whose stream has nothing to do with the copy.
+            stream = torch.cuda.current_stream(fine.device)
             # Into pinned memory, behind what is queued: neither this nor the next steps wait for it.
             fine = fine.to("cpu", non_blocking=True)
             self._event = torch.cuda.Event()  # type: ignore[no-untyped-call]
-            self._event.record()
+            self._event.record(stream)
         self._fine = fine
 
     def fine(self) -> bool:

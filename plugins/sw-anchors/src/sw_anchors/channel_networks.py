@@ -33,7 +33,7 @@ class _Slice:
 class ChannelNetworks:
     """Places of the parameters of a ChannelMixture, of which it holds none.
 
-    columns     [3,F] int32: columns of mean, scale and logit of each channel in the outputs [S,3F]
+    columns     [3,F] int32: columns of mean, scale and logit of each channel in the outputs [S,3F]; each column once
 
     Inputs are F values, 3F numbers of context if there is any, 1, and zeros up to `inputs`.
     """
@@ -50,7 +50,7 @@ class ChannelNetworks:
         numbers = iter(self._numbered())
         first = torch.zeros(sum(widths), self.inputs, dtype=torch.int64)
         last, self._slices, row, start = [], [], 0, first.numel()
-        columns = torch.empty(PARTS, features, dtype=torch.int32)
+        columns = torch.full((PARTS, features), -1, dtype=torch.int32)
         for i, (own, size, width) in enumerate(zip(channel.starts, channel.slices, widths, strict=True)):
             hidden = self._hidden(channel, i)
             found = torch.zeros(PARTS * size, width, dtype=torch.int64)
@@ -67,11 +67,20 @@ class ChannelNetworks:
             self._slices.append(_Slice(slice(row, row + width), outputs, start))
             last.append(found.flatten())
             row, start = row + width, start + found.numel()
+        # Kernels read and write where the columns point, and on a GPU nobody could look at them without a wait.
+        if columns.flatten().sort().values.tolist() != list(range(PARTS * features)):
+            raise ValueError(f"slices {list(channel.slices)} at {list(channel.starts)} are not the channels, each once")
         sources = torch.cat([first.flatten(), *last])
         self._first = first.shape
         self._sources, self.columns = sources.to(device), columns.to(device)
         self._places = self._places_of(sources).to(device)
         self._constants = torch.tensor(CONSTANTS).to(device)
+
+    def check_for(self, features: int, device: torch.device) -> None:
+        """Raise ValueError unless the networks are of so many features, and on that device."""
+        own, where = self.columns.shape[1], self.columns.device
+        if (own, where) != (features, device):
+            raise ValueError(f"networks of {own} channels on {where} are not for {features} features on {device}")
 
     @staticmethod
     def parameters(channel: ChannelMixture) -> list[nn.Parameter]:

@@ -13,13 +13,13 @@ import torch
 from torch import Tensor, nn
 
 from sw_anchors.anchors import AnchorAttributes, AnchorModel
-from sw_anchors.expected_rows import ExpectedRows
 from sw_anchors.forecasts import AnchorContext, AnchorForecast, AnchorRate, Triple, triple
 from sw_anchors.fused_ops import anchor_values, sample_bits, take_rows, widen
 from sw_anchors.lattice import Margin, bounds_of, coded_positions, position_codes
 from sw_anchors.mixture_bits import MaskKind, Predicted, fit_mixture_kernel, mixture_bits
 from sw_anchors.noisy_values import Noise, Tables, draws, noisy_values
 from sw_anchors.pool_rows import bernoulli_rows
+from sw_anchors.seen_rows import ExpectedRows, SeenRows
 from sw_codecs.entropy.rates import lower_bound
 from sw_codecs.positions.morton import interleave
 from sw_codecs.quantizers.binary import SteMask
@@ -159,7 +159,7 @@ class CodedAnchors(AnchorModel):
             return super().gaussians(camera, rasterizer)
         with torch.no_grad():
             rows = ExpectedRows(*self._seen_in_order(camera, rasterizer), places)
-        return self.decode(camera, rows)
+        return self.decode_seen(camera, rows)
 
     # Masks
 
@@ -255,16 +255,14 @@ class CodedAnchors(AnchorModel):
         """Decoder of fixed sizes, where there is one and it decodes: in a step of training."""
         return self.fixed if self.training and torch.is_grad_enabled() and self.features.requires_grad else None
 
-    def decode(self, camera: Camera, rows: Tensor | ExpectedRows) -> GaussianInputs:
+    def decode(self, camera: Camera, rows: Tensor) -> GaussianInputs:
+        return self.decode_seen(camera, SeenRows(rows))
+
+    def decode_seen(self, camera: Camera, rows: SeenRows) -> GaussianInputs:
+        """As `decode`, of rows whose number the host need not know yet. A subclass overrides this, not `decode`."""
         fixed = self._replaying()
-        if fixed is not None:
-            found = fixed.decode(self, camera, rows)
-            if found is None and isinstance(rows, ExpectedRows):
-                rows = rows.known()
-                found = fixed.decode(self, camera, rows)
-            if found is not None:
-                return found
-        return super().decode(camera, rows if isinstance(rows, Tensor) else rows.known())
+        found = None if fixed is None else fixed.decode(self, camera, rows)
+        return super().decode(camera, rows.known()) if found is None else found
 
     def attributes(self, rows: Tensor) -> AnchorAttributes:
         """Full-precision, noisy or rounded attributes, by phase and mode; each of `rows` at most once."""

@@ -20,10 +20,10 @@ from torch.autograd.function import once_differentiable
 
 from splatwizard_core.api import Camera, GaussianInputs
 from sw_anchors.coded_anchors import ENTROPY
-from sw_anchors.expected_rows import ExpectedRows
 from sw_anchors.fixed_step import PARAMETERS, FixedRows, decode_rows, inputs_of, sample_capacity
 from sw_anchors.fused_ops import add_rows, put_rows
 from sw_anchors.pool_rows import PoolRows
+from sw_anchors.seen_rows import SeenRows, capacity_of
 from sw_anchors.step_graphs import CapturedStep, FixedStep, PlainStep, Watched, add_gradients
 
 if TYPE_CHECKING:
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-SMALLEST = 256
 MORE = 1.04
 """Of the anchors that a camera saw last, as many are expected the next time."""
 KEPT = 16
@@ -78,20 +77,27 @@ class FixedDecoder:
             return None
         return capacity_of(min(math.ceil(seen * num_rows / of * MORE), num_rows))
 
-    def decode(self, model: CodedAnchors, camera: Camera, rows: Tensor | ExpectedRows) -> GaussianInputs | None:
-        """Decode the anchors `rows` [V]: their Gaussians with opacity > 0.
+    def decode(self, model: CodedAnchors, camera: Camera, rows: SeenRows) -> GaussianInputs | None:
+        """Decode the anchors `rows`: their Gaussians with opacity > 0; once more where not all had a place.
 
         None where the model has no form for it, or the GPU refused a graph or had no memory for it; that is said once.
-        Also where more are seen than was expected.
         """
+        found = self._decode(model, camera, rows)
+        if found is None and not rows.fit():
+            found = self._decode(model, camera, SeenRows(rows.known()))
+        if found is not None:
+            self._seen[camera] = len(found.extras["anchors"].rows), model.num_rows
+        return found
+
+    def _decode(self, model: CodedAnchors, camera: Camera, rows: SeenRows) -> GaussianInputs | None:
+        """As `decode`; None too where not all have a place."""
         parts = model.context_rows() if model.phase == ENTROPY else ()
         if self._failed or parts is None:
             return None
         pooled = model.SAMPLES_ALL and model.phase == ENTROPY
         places = capacity_of(sample_capacity(model.num_rows, model.sample)) if pooled else 0
         try:
-            capacity = len(rows.rows) if isinstance(rows, ExpectedRows) else capacity_of(len(rows))
-            prepared = self._prepared(model, parts, capacity, places)
+            prepared = self._prepared(model, parts, rows.capacity, places)
         except RuntimeError as error:
             self._failed = True
             log.warning("training goes on without CUDA graphs, slower: %s", str(error).partition("\n")[0])
@@ -107,10 +113,7 @@ class FixedDecoder:
                 pool.load(model, [source.detach() for source in sources], parts)
         pool_rows = None if pool is None else pool.rows
         results, others = _Decoded.found(prepared.step, rows, pool_rows, self._watched.learning, sources)
-        found = inputs_of(model, at, rows, (results, others))
-        if found is not None:
-            self._seen[camera] = len(found.extras["anchors"].rows), model.num_rows
-        return found
+        return inputs_of(model, at, rows, (results, others))
 
     def _prepared(self, model: CodedAnchors, parts: tuple[Tensor, ...], capacity: int, places: int) -> _Prepared:
         key = (*model.step_key(), *(part.shape[1:] for part in parts))
@@ -194,7 +197,7 @@ class _Decoded(torch.autograd.Function):
     def found(
         cls,
         step: FixedStep,
-        rows: Tensor | ExpectedRows,
+        rows: SeenRows,
         pool: Tensor | None,
         networks: list[Tensor],
         sources: list[Tensor],
@@ -208,7 +211,7 @@ class _Decoded(torch.autograd.Function):
     def forward(
         ctx: Any,
         step: FixedStep,
-        rows: Tensor | ExpectedRows,
+        rows: SeenRows,
         pool: Tensor | None,
         networks: list[Tensor],
         counts: list[int],
@@ -229,11 +232,9 @@ class _Decoded(torch.autograd.Function):
     def backward(ctx: Any, *slopes: Tensor | None) -> tuple[Tensor | None, ...]:
         (pool,) = ctx.saved_tensors
         rows, count = ctx.rows, len(ctx.shapes)
-        if isinstance(rows, ExpectedRows):
-            rows = rows.rows[: rows.number()]
         grads = ctx.step.backward(slopes[: ctx.count])
         add_gradients(ctx.networks, grads[count * (1 if pool is None else 2) :])
-        found = put_rows(rows, grads[:count], ctx.shapes[0][0])
+        found = put_rows(rows.placed(), grads[:count], ctx.shapes[0][0])
         if pool is not None:
             own = grads[count : 2 * count]
             found = [
@@ -243,10 +244,3 @@ class _Decoded(torch.autograd.Function):
             add_rows(pool, own, found)
         shaped = (None if grad is None else grad.view(shape) for grad, shape in zip(found, ctx.shapes, strict=True))
         return None, None, None, None, None, *shaped
-
-
-def capacity_of(count: int) -> int:
-    """Rows of the tensors for `count` anchors: more than these, in four sizes an octave."""
-    size = max(count + 1, SMALLEST)
-    unit = 1 << (size.bit_length() - 3)
-    return -(-size // unit) * unit

@@ -18,11 +18,11 @@ from torch import Tensor
 from splatwizard_core.api import Camera, GaussianInputs
 from sw_anchors.anchors import AnchorSelection
 from sw_anchors.coded_anchors import ENTROPY, MASK_THRESHOLD, QUANTIZED
-from sw_anchors.expected_rows import ExpectedRows
 from sw_anchors.forecasts import AnchorRate
 from sw_anchors.fused_ops import load_rows, noisy_rows
 from sw_anchors.neural_gaussians import visible_gaussians
 from sw_anchors.pool_rows import PoolRows
+from sw_anchors.seen_rows import SeenRows
 from sw_anchors.step_graphs import Found
 from sw_anchors.view_networks import network_outputs
 
@@ -54,20 +54,16 @@ class FixedRows:
     parts: tuple[Tensor, ...]
     random: Tensor
 
-    def load(self, model: CodedAnchors, camera: Camera, rows: Tensor | ExpectedRows, parts: Sequence[Tensor]) -> None:
-        """Copy the anchors `rows` [V] of the model, V < C, and draw anew."""
-        if isinstance(rows, ExpectedRows):
-            self.count.copy_(rows.count)
-            rows = rows.rows
-        else:
-            self.count.fill_(len(rows))
+    def load(self, model: CodedAnchors, camera: Camera, rows: SeenRows, parts: Sequence[Tensor]) -> None:
+        """Copy the anchors `rows` of the model, and draw anew; C is their capacity."""
+        rows.write_number(self.count)
         self.center.copy_(camera.center)
         weights = model.mask_weights()
         pairs = [(model.positions(), self.positions), *zip(parts, self.parts, strict=True)]
         pairs += [(getattr(model, name).detach(), mine) for name, mine in zip(PARAMETERS, self.parameters, strict=True)]
         if weights is not None and self.weights is not None:
             pairs.append((weights, self.weights))
-        load_rows(rows, [source for source, _ in pairs], [mine.detach() for _, mine in pairs])
+        load_rows(rows.loaded, [source for source, _ in pairs], [mine.detach() for _, mine in pairs])
         self.draw(model)
 
     def draw(self, model: CodedAnchors) -> None:
@@ -137,19 +133,18 @@ def sample_capacity(capacity: int, share: float) -> int:
     return min(capacity, math.ceil(capacity * share + 6 * math.sqrt(capacity * share * (1 - share)) + 8))
 
 
-def inputs_of(model: CodedAnchors, at: FixedRows, rows: Tensor | ExpectedRows, found: Found) -> GaussianInputs | None:
+def inputs_of(model: CodedAnchors, at: FixedRows, rows: SeenRows, found: Found) -> GaussianInputs | None:
     """The Gaussians with opacity > 0, from what `decode_rows` found; anchors `rows` are those that were loaded.
 
     None: more anchors are seen than there were places for. Waits for the device once, for the number of Gaussians.
     """
     (alpha, geometry, color, offsets, scales, masks, *rate), counts = found
     spawned = visible_gaussians(alpha, geometry, color, at.positions, offsets, scales, masks)
-    if isinstance(rows, ExpectedRows):
-        if rows.number() >= len(at.positions):
-            return None
-        rows = rows.rows[: rows.number()]
+    if not rows.fit():
+        return None
+    own = rows.placed()
     seen = spawned.alphas if model.COUNTS_MASKED else spawned.all_opacities
-    extras: dict[str, Any] = {"masks": masks, "anchors": AnchorSelection(rows, seen[: len(rows)], spawned.drawn)}
+    extras: dict[str, Any] = {"masks": masks, "anchors": AnchorSelection(own, seen[: len(own)], spawned.drawn)}
     if rate:
         extras["rate"] = AnchorRate(rate[0], counts[0], counts[1], rate[1] if len(rate) > 1 else None)
     return GaussianInputs(

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sw_anchors.channel_networks import ChannelNetworks
-from sw_anchors.row_kernels import bits_fit_kernel
+from sw_anchors.row_kernels import bits_fit_kernel, summed_bits
 
 
 class MaskKind(IntEnum):
@@ -71,8 +71,11 @@ def mixture_bits(
     counted     [S] factors of the bits of an anchor
     networks    of channels, of `parameters`: they give the second Gaussian; None: there is one
 
-    The derivative by the bits must not be negative.
+    The derivative by the bits must not be negative. Raises ValueError if the networks are not of the F channels, or
+    are on another device.
     """
+    if networks is not None:
+        networks.check_for(x.shape[1] - 6 - 3 * masks.shape[1], x.device)
     given = [each.contiguous() for each in (x, outputs, steps, masks, counted)]
     bits, by_group = _MixtureBits.apply(*given, predicted, networks, *parameters)  # type: ignore[no-untyped-call]
     return bits, by_group
@@ -107,9 +110,7 @@ class _MixtureBits(torch.autograd.Function):
         )  # fmt: skip
         ctx.networks = networks
         ctx.save_for_backward(*slopes, *kept)
-        by_group = bits.sum(dim=0)
-        ctx.mark_non_differentiable(by_group)
-        return by_group.sum(), by_group
+        return summed_bits(ctx, bits)
 
     @staticmethod
     @once_differentiable

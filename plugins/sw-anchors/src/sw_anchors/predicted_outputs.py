@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sw_anchors.native import ANCHORS
+from sw_anchors.predicted_steps import steps_by_torch, steps_fit_kernel
 
 Parameters = tuple[Tensor, Tensor, Tensor, Tensor]
 
@@ -45,18 +45,13 @@ class _StepsAndOutputs(torch.autograd.Function):
         offset: float,
         smallest: float,
     ) -> tuple[Tensor, Tensor]:
-        given = [t.contiguous() for t in (features, first, first_bias, last[part], last_bias[part], base)]
-        features = given[0]
+        features, *parameters, base = (
+            t.contiguous() for t in (features, first, first_bias, last[part], last_bias[part], base)
+        )
         ctx.bounds, ctx.part, ctx.start = (offset, smallest), part, start
-        ctx.by_kernel = all(t.dtype == torch.float32 and t.device.type == "cpu" for t in given) and ANCHORS.try_load()
-        if ctx.by_kernel:
-            steps, hidden, tangents = torch.ops.sw_anchors.predicted_steps(
-                features, given[1:5], given[5], offset, smallest
-            )
-        else:
-            hidden = torch.addmm(first_bias, features, first.t()).relu_()
-            tangents = torch.addmm(last_bias[part], hidden, last[part].t()).tanh_()
-            steps = (tangents + offset).clamp_(min=smallest).mul_(base)
+        ctx.by_kernel = steps_fit_kernel(features, *parameters, base)
+        form = torch.ops.sw_anchors.predicted_steps if ctx.by_kernel else steps_by_torch
+        steps, hidden, tangents = form(features, parameters, base, offset, smallest)
         ctx.save_for_backward(features, first, first_bias, last, last_bias, base, hidden, tangents)
         return steps, torch.addmm(last_bias, hidden[start:], last.t())
 

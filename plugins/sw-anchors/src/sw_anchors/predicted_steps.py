@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -25,14 +26,28 @@ def predicted_steps(
     parameters  weight [H,I] and bias [H] of the layer with ReLU, weight [3,H] and bias [3] of the outputs t
     base        [3]: a step is base max(offset + tanh(t), smallest)
     """
-    given = (features, *parameters, base)
-    if all(t.dtype == torch.float32 and t.device.type == "cpu" for t in given) and ANCHORS.try_load():
+    if steps_fit_kernel(features, *parameters, base):
         found: tuple[Tensor, Tensor] = _ByKernel.apply(base, offset, smallest, features, *parameters)  # type: ignore[no-untyped-call]
         return found
+    steps, hidden, _ = steps_by_torch(features, parameters, base, offset, smallest)
+    return steps, hidden
+
+
+def steps_fit_kernel(*tensors: Tensor) -> bool:
+    """Whether there is a kernel for the steps of these tensors; loads it."""
+    return all(t.dtype == torch.float32 and t.device.type == "cpu" for t in tensors) and ANCHORS.try_load()
+
+
+def steps_by_torch(
+    features: Tensor, parameters: Sequence[Tensor], base: Tensor, offset: float, smallest: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """(steps [V,3], hidden layer [V,H], tanh(t) [V,3]) as the kernel `predicted_steps` finds them; differentiable."""
     weight, bias, last, last_bias = parameters
-    hidden = torch.relu(torch.nn.functional.linear(features, weight, bias))
-    steps = offset + torch.tanh(torch.nn.functional.linear(hidden, last, last_bias))
-    return (steps if math.isinf(smallest) else steps.clamp(min=smallest)) * base, hidden
+    hidden = torch.addmm(bias, features, weight.t()).relu_()
+    tangents = torch.addmm(last_bias, hidden, last.t()).tanh_()
+    # Not in place from here on: autograd would copy what the floor needs on its way back.
+    steps = tangents + offset
+    return (steps if math.isinf(smallest) else steps.clamp(min=smallest)) * base, hidden, tangents
 
 
 class _ByKernel(torch.autograd.Function):

@@ -110,11 +110,16 @@ class SampleBits(torch.autograd.Function):
         given = (each.contiguous() for each in (x, mean, scale, steps, counted, masks))
         bits, *slopes = torch.ops.sw_anchors.sample_bits(*given, p_min, smallest_scale)
         ctx.save_for_backward(*slopes)
-        by_group = bits.sum(dim=0)
-        ctx.mark_non_differentiable(by_group)
-        return by_group.sum(), by_group
+        return summed_bits(ctx, bits)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, slope: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         return *torch._foreach_mul(ctx.saved_tensors, slope), None, None, None
+
+
+def summed_bits(ctx: Any, bits: Tensor) -> tuple[Tensor, Tensor]:
+    """(sum of bits [S,3]; the same by group [3], without gradient): what the forward of a node of bits returns."""
+    by_group = bits.sum(dim=0)
+    ctx.mark_non_differentiable(by_group)
+    return by_group.sum(), by_group

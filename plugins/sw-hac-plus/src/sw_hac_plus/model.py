@@ -13,13 +13,13 @@ import torch
 from sw_anchors.anchors import AnchorAttributes, linear_layers
 from sw_anchors.channel_networks import ChannelNetworks
 from sw_anchors.coded_anchors import MASK_THRESHOLD
-from sw_anchors.expected_rows import ExpectedRows
 from sw_anchors.forecasts import AnchorForecast, AnchorRate
 from sw_anchors.fused_ops import anchor_values, noisy_rows, times_ones
 from sw_anchors.grid_anchors import SMALLEST_STEP, GridAnchors
 from sw_anchors.lattice import position_codes
 from sw_anchors.mixture_bits import MaskKind, fit_mixture_kernel, mixture_bits
 from sw_anchors.predicted_outputs import steps_and_outputs
+from sw_anchors.seen_rows import SeenRows
 from sw_anchors.voxel_lattice import voxel_integers, voxel_positions, within_reach
 from torch import Tensor, nn
 
@@ -85,9 +85,9 @@ class HACPlusAnchors(GridAnchors):
         found = super().attributes(rows)
         return dataclasses.replace(found, extras={**found.extras, "masks": found.masks}) if self.training else found
 
-    def decode(self, camera: Camera, rows: Tensor | ExpectedRows) -> GaussianInputs:
-        """The Gaussians of the anchors `rows` [V]; masks have a gradient through opacities and scales alike."""
-        found = super().decode(camera, rows)
+    def decode_seen(self, camera: Camera, rows: SeenRows) -> GaussianInputs:
+        """The Gaussians of the anchors `rows`; masks have a gradient through opacities and scales alike."""
+        found = super().decode_seen(camera, rows)
         if "masks" not in found.extras:
             return found
         # Of those drawn all masks are 1; what is masked would be drawn with scale 0, and is left out.

@@ -1,0 +1,93 @@
+"""Rows of the anchors that a view sees, in one form whether the host knows their number or not yet.
+
+Where a view was drawn before, about as many are expected as it saw last: so the host need not wait to learn how many
+there are before it starts their decoding.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+SMALLEST = 256
+"""Capacity of the views that see next to nothing."""
+
+
+class SeenRows:
+    """Rows of the anchors that are seen, all of them known to the host.
+
+    loaded      [V] int64: what tensors of `capacity` rows are filled with; V < capacity
+    capacity    one of a few sizes, which serve all views
+    """
+
+    def __init__(self, rows: Tensor) -> None:
+        """Take rows [V] int64."""
+        self.loaded, self.capacity = rows, capacity_of(len(rows))
+
+    def write_number(self, to: Tensor) -> None:
+        """Write how many are seen into a scalar of their device. Waits for nothing."""
+        to.fill_(len(self.loaded))
+
+    def fit(self) -> bool:
+        """Whether all that are seen have a place, and one is left."""
+        return True
+
+    def placed(self) -> Tensor:
+        """[V] int64: those that have a place."""
+        return self.loaded
+
+    def known(self) -> Tensor:
+        """[V] int64: all that are seen."""
+        return self.loaded
+
+
+class ExpectedRows(SeenRows):
+    """SeenRows that the device finds, in as many places as are expected; the host may ask for their number later.
+
+    loaded      [C] int64; places that no anchor takes name row 0. Seen ones beyond C are left out: `number` tells
+    capacity    C
+    """
+
+    def __init__(self, order: Tensor, seen: Tensor, places: int) -> None:
+        """Take the first `places` rows of order [N] int64 that are seen [N] bool; N > 0."""
+        self._order, self._seen = order, seen
+        taken = seen.cumsum(0)
+        self._count = taken[-1]
+        # What is not seen, or has no place, is written behind the last one.
+        at = (taken - 1).masked_fill_(~seen, places).clamp_(max=places)
+        self.loaded, self.capacity = order.new_zeros(places + 1).scatter_(0, at, order)[:places], places
+        self._on_host, self._copied = self._count, None
+        if order.is_cuda:
+            self._on_host = torch.empty((), dtype=torch.int64, pin_memory=True)
+            self._on_host.copy_(self._count, non_blocking=True)
+            self._copied = torch.cuda.Event()  # type: ignore[no-untyped-call]
+            # Of its own device: another may be the current one, whose stream has nothing to do with the copy.
+            self._copied.record(torch.cuda.current_stream(order.device))
+
+    def number(self) -> int:
+        """Number of seen rows, perhaps more than there are places. Waits until the device has counted them."""
+        if self._copied is not None:
+            self._copied.synchronize()
+        return int(self._on_host)
+
+    def write_number(self, to: Tensor) -> None:
+        to.copy_(self._count)
+
+    def fit(self) -> bool:
+        """As of SeenRows; waits as `number`."""
+        return self.number() < self.capacity
+
+    def placed(self) -> Tensor:
+        """As of SeenRows; waits as `number`."""
+        return self.loaded[: self.number()]
+
+    def known(self) -> Tensor:
+        """As of SeenRows; waits for the device."""
+        return self._order[self._seen]
+
+
+def capacity_of(count: int) -> int:
+    """Rows of the tensors for `count` anchors: more than these, in four sizes an octave."""
+    size = max(count + 1, SMALLEST)
+    unit = 1 << (size.bit_length() - 3)
+    return -(-size // unit) * unit
