@@ -167,7 +167,9 @@ class GaussianInputs:
 
     def requires_grad(self) -> bool:
         """Whether autograd would record anything for these inputs now."""
-        return torch.is_grad_enabled() and any(t.requires_grad for t in self.tensors().values())
+        if not torch.is_grad_enabled():
+            return False
+        return self.means.requires_grad or any(t.requires_grad for t in self.tensors().values())
 
     def validate(self) -> None:
         """Raise ShapeError unless the fields fit together (values are the rasterizer's business)."""

@@ -51,11 +51,8 @@ class View:
             if pixels.is_cuda:  # in one launch; on a CPU two passes are faster
                 return torch.div(pixels, 255, out=torch.empty(pixels.shape, device=pixels.device))
             return pixels.float().div_(255)
-        rgb = pixels[:3].float() / 255
-        alpha = pixels[3:].float() / 255
-        if background is None:
-            return rgb * alpha
-        return rgb * alpha + background.to(device)[:, None, None] * (1 - alpha)
+        color, alpha = torch.split(pixels / 255, 3)
+        return color * alpha if background is None else torch.lerp(background.to(device)[:, None, None], color, alpha)
 
     def keep_on(self, device: torch.device | str) -> None:
         """Keep a copy of `pixels` in a GPU's memory, so that `image` need not send it each time; "cpu" drops it."""
