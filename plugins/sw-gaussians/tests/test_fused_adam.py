@@ -90,6 +90,14 @@ def test_it_is_offered_where_no_task_but_the_statistics_follows(monkeypatch):
     for step in range(1, 41):
         stage.raster_options(step, background)
     assert offered == []  # unless it is asked for
+    stage.fuses_updates = None
+    for step in range(1, 41):
+        stage.raster_options(step, background)
+    assert offered == []  # or there are many Gaussians
+    monkeypatch.setattr("sw_gaussians.stage.FUSED_FROM", stage._optimizer.model.num_rows)
+    stage.raster_options(step := 2, background)
+    assert offered == [2]
+    offered.clear()
     stage.fuses_updates = True
     for step in range(1, 41):
         stage.raster_options(step, background)
@@ -121,8 +129,12 @@ def test_it_is_refused_beside_other_optimizers(values):
         ThreeDGSStage(GaussianTraining.model_validate(values), fuses_updates=True)
 
 
-def test_it_is_refused_on_a_cpu():
+def test_it_is_refused_on_a_cpu_if_it_is_asked_for():
     model, _ = made(FusingOptimizer)
     scene = SimpleNamespace(protocol=SimpleNamespace(background="black"))
+    context = SimpleNamespace(model=model, scene=scene, generator=lambda name: torch.Generator())
     with pytest.raises(ConfigError, match="CUDA"):
-        ThreeDGSStage(GaussianTraining(), fuses_updates=True).begin(SimpleNamespace(model=model, scene=scene))
+        ThreeDGSStage(GaussianTraining(), fuses_updates=True).begin(context)
+    assert ThreeDGSStage(GaussianTraining(), fuses_updates=None).begin(context) is model
+    for values in ({"sparse_adam": "per_row"}, {"fast": {"sh_every": 2}}):
+        assert ThreeDGSStage(GaussianTraining.model_validate(values), fuses_updates=None).fuses_updates is None

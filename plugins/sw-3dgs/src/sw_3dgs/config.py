@@ -26,8 +26,10 @@ class ThreeDGSConfig(Choosing, GaussianTraining):
     init: InputFile = Field(
         "", description="a .ply to start from, with all its SH bands active; empty: the scene's points"
     )
-    fused_updates: bool = Field(
-        False, description="on CUDA, update spherical harmonics in the backward pass: equal but for rounding"
+    fused_updates: bool | None = Field(
+        None,
+        description="on CUDA, update spherical harmonics in the backward pass, equal but for rounding; None: from "
+        "500,000 Gaussians on, where it is faster",
     )
     codec: CodecChoice = Field(CodecChoice(name="gaussians-exact"), description="what writes the file")
 
