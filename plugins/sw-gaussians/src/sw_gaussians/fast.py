@@ -22,7 +22,7 @@ def rate_factors(share: float) -> dict[str, float]:
 
 
 FAST: Mapping[str, Any] = {
-    "iterations": 8_700,
+    "iterations": 8_300,
     "scale_schedule": True,  # all plans below are in steps of 30,000
     "sh_interval": 3_000,
     "lr.opacity": 0.025,
