@@ -9,6 +9,7 @@ from hac_models import make
 from sw_anchors.coded_anchors import ENTROPY, FULL, QUANTIZED
 from sw_anchors.fixed_decoder import FixedDecoder
 from sw_anchors.fixed_step import FixedRows, sample_capacity, sample_of
+from sw_anchors.grid_anchors import GridAnchors
 from sw_anchors.seen_rows import ExpectedRows, SeenRows, capacity_of
 from sw_anchors.testing import check_fixed_decoder
 from sw_reference.testing.raster_scenes import front_camera
@@ -153,6 +154,21 @@ def test_a_view_that_comes_again_is_decoded_though_graphs_are_refused_by_then(se
     assert model.fixed.expected(camera, N) == 256
     assert sorted(model.gaussians(camera, Seen(range(seen))).extras["anchors"].rows.tolist()) == list(range(seen))
     assert model.fixed.expected(camera, N) is None
+
+
+def test_a_decode_of_a_subclass_is_asked_for_views_that_come_again_too():
+    asked = []
+
+    class Own(GridAnchors):
+        def decode(self, camera, rows):
+            asked.append(rows)
+            return super().decode(camera, rows)
+
+    model, camera = trained().train(), front_camera()
+    model.__class__, model.fixed = Own, FixedDecoder(graphs=False)
+    for _ in range(2):
+        model.gaussians(camera, Seen(range(100)))
+    assert [rows.tolist() for rows in asked] == 2 * [list(range(100))]
 
 
 def test_anchors_are_expected_in_proportion_to_how_many_there_are():
