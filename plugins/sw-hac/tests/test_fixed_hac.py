@@ -156,19 +156,19 @@ def test_a_view_that_comes_again_is_decoded_though_graphs_are_refused_by_then(se
     assert model.fixed.expected(camera, N) is None
 
 
-def test_a_decode_of_a_subclass_is_asked_for_views_that_come_again_too():
+@pytest.mark.parametrize("name", ["visible_anchors", "decode"])
+def test_what_a_subclass_has_of_its_own_is_asked_for_views_that_come_again_too(name):
     asked = []
 
-    class Own(GridAnchors):
-        def decode(self, camera, rows):
-            asked.append(rows)
-            return super().decode(camera, rows)
+    def own(self, *given):
+        asked.append(given)
+        return getattr(GridAnchors, name)(self, *given)
 
     model, camera = trained().train(), front_camera()
-    model.__class__, model.fixed = Own, FixedDecoder(graphs=False)
+    model.__class__, model.fixed = type("Own", (GridAnchors,), {name: own}), FixedDecoder(graphs=False)
     for _ in range(2):
-        model.gaussians(camera, Seen(range(100)))
-    assert [rows.tolist() for rows in asked] == 2 * [list(range(100))]
+        assert model.gaussians(camera, Seen(range(100))).extras["anchors"].rows.tolist() == list(range(100))
+    assert len(asked) == 2
 
 
 def test_anchors_are_expected_in_proportion_to_how_many_there_are():

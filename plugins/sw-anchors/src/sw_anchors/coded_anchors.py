@@ -154,8 +154,9 @@ class CodedAnchors(AnchorModel):
     def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
         """As of AnchorModel. A view that was drawn before is decoded before the host knows how many anchors it sees."""
         fixed = self._replaying()
-        # A `decode` of a subclass's own takes rows that are known, and would be left out.
-        own = type(self).decode is not CodedAnchors.decode
+        # What a subclass has of its own gives or takes rows that are known, and would be left out.
+        cls = type(self)
+        own = cls.visible_anchors is not CodedAnchors.visible_anchors or cls.decode is not CodedAnchors.decode
         places = None if fixed is None or own else fixed.expected(camera, self.num_rows)
         if places is None:
             return super().gaussians(camera, rasterizer)
@@ -263,7 +264,8 @@ class CodedAnchors(AnchorModel):
     def decode_seen(self, camera: Camera, rows: SeenRows) -> GaussianInputs:
         """As `decode`, of rows whose number the host need not know yet.
 
-        A subclass overrides this rather than `decode`: with one of its own each view waits for that number.
+        A subclass overrides this rather than `decode`: with a `decode` or `visible_anchors` of its own each view waits
+        for that number.
         """
         fixed = self._replaying()
         found = None if fixed is None else fixed.decode(self, camera, rows)
