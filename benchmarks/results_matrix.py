@@ -95,7 +95,8 @@ class Job:
 
 def scene_name(scene: str) -> str:
     """Name of a scene's folder below --out, as `sw run` makes it; demo:tiny is demo-tiny."""
-    return Path(scene).name.replace(":", "-")
+    path = Path(scene)
+    return (path.resolve() if path.exists() else path).name.replace(":", "-")  # a link is followed
 
 
 def asked(text: str) -> tuple[str, str, str]:

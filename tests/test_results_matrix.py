@@ -120,6 +120,12 @@ def test_runs_are_looked_for_where_sw_run_puts_them(script, scene, folder):
     assert script.scene_name(scene) == folder
 
 
+def test_a_link_to_a_scene_is_named_as_sw_run_names_it(script, tmp_path):
+    (tmp_path / "lego").mkdir()
+    (tmp_path / "link").symlink_to("lego")
+    assert script.scene_name(str(tmp_path / "link")) == "lego"
+
+
 def test_an_interrupted_process_is_given_time_for_its_checkpoint(script, monkeypatch, tmp_path):
     noted = tmp_path / "noted"
     program = (

@@ -8,6 +8,7 @@ from sw_gaussians import fragments
 from sw_gaussians.config import MCMC
 from sw_gaussians.fused_adam import FusingOptimizer
 from sw_gaussians.mcmc import draw
+from sw_gaussians.native import GAUSSIANS
 from sw_gaussians.stage import ThreeDGSStage
 from sw_gaussians.start import gaussians_from_points
 from sw_gaussians.statistics import accumulate_in_torch, accumulate_statistics
@@ -189,6 +190,7 @@ def test_statistics_of_one_launch_are_those_of_many():
 
 
 def test_sums_over_fragments_of_one_launch_are_those_of_many():
+    assert GAUSSIANS.has_cuda(), "built without CUDA"
     generator = torch.Generator().manual_seed(6)
     ours, theirs = (torch.zeros(500, 3, device="cuda") for _ in range(2))
     for _ in range(3):

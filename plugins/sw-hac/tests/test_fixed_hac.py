@@ -9,6 +9,7 @@ from hac_models import make
 from sw_anchors.coded_anchors import ENTROPY, FULL, QUANTIZED
 from sw_anchors.fixed_decoder import FixedDecoder
 from sw_anchors.fixed_step import FixedRows, sample_capacity, sample_of
+from sw_anchors.grid_anchors import GridAnchors
 from sw_anchors.seen_rows import ExpectedRows, SeenRows, capacity_of
 from sw_anchors.testing import check_fixed_decoder
 from sw_reference.testing.raster_scenes import front_camera
@@ -153,6 +154,21 @@ def test_a_view_that_comes_again_is_decoded_though_graphs_are_refused_by_then(se
     assert model.fixed.expected(camera, N) == 256
     assert sorted(model.gaussians(camera, Seen(range(seen))).extras["anchors"].rows.tolist()) == list(range(seen))
     assert model.fixed.expected(camera, N) is None
+
+
+@pytest.mark.parametrize("name", ["visible_anchors", "decode"])
+def test_what_a_subclass_has_of_its_own_is_asked_for_views_that_come_again_too(name):
+    asked = []
+
+    def own(self, *given):
+        asked.append(given)
+        return getattr(GridAnchors, name)(self, *given)
+
+    model, camera = trained().train(), front_camera()
+    model.__class__, model.fixed = type("Own", (GridAnchors,), {name: own}), FixedDecoder(graphs=False)
+    for _ in range(2):
+        assert model.gaussians(camera, Seen(range(100))).extras["anchors"].rows.tolist() == list(range(100))
+    assert len(asked) == 2
 
 
 def test_anchors_are_expected_in_proportion_to_how_many_there_are():

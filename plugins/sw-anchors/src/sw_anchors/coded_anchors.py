@@ -154,7 +154,10 @@ class CodedAnchors(AnchorModel):
     def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
         """As of AnchorModel. A view that was drawn before is decoded before the host knows how many anchors it sees."""
         fixed = self._replaying()
-        places = None if fixed is None else fixed.expected(camera, self.num_rows)
+        # What a subclass has of its own gives or takes rows that are known, and would be left out.
+        cls = type(self)
+        own = cls.visible_anchors is not CodedAnchors.visible_anchors or cls.decode is not CodedAnchors.decode
+        places = None if fixed is None or own else fixed.expected(camera, self.num_rows)
         if places is None:
             return super().gaussians(camera, rasterizer)
         with torch.no_grad():
@@ -259,7 +262,11 @@ class CodedAnchors(AnchorModel):
         return self.decode_seen(camera, SeenRows(rows))
 
     def decode_seen(self, camera: Camera, rows: SeenRows) -> GaussianInputs:
-        """As `decode`, of rows whose number the host need not know yet. A subclass overrides this, not `decode`."""
+        """As `decode`, of rows whose number the host need not know yet.
+
+        A subclass overrides this rather than `decode`: with a `decode` or `visible_anchors` of its own each view waits
+        for that number.
+        """
         fixed = self._replaying()
         found = None if fixed is None else fixed.decode(self, camera, rows)
         return super().decode(camera, rows.known()) if found is None else found
