@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 
 from pydantic import Field
 from sw_gaussians.choices import Choosing, CodecChoice, Moved
-from sw_gaussians.config import GaussianTraining
+from sw_gaussians.config import FUSED_FROM, GaussianTraining
 
 from splatwizard_core.api import InputFile
 from sw_codecs.models.settings import QuantizedSettings
@@ -29,7 +29,7 @@ class ThreeDGSConfig(Choosing, GaussianTraining):
     fused_updates: bool | None = Field(
         None,
         description="on CUDA, update spherical harmonics in the backward pass, equal but for rounding; None: from "
-        "500,000 Gaussians on, where it is faster",
+        f"{FUSED_FROM:,} Gaussians on, where it is faster",
     )
     codec: CodecChoice = Field(CodecChoice(name="gaussians-exact"), description="what writes the file")
 

@@ -22,7 +22,7 @@ from sw_gaussians import fast_tasks, fragments, tasks
 from sw_gaussians import mcmc_tasks as mcmc
 from sw_gaussians.averaging import AverageParameters
 from sw_gaussians.cadence import CadencedOptimizer, SparseCadencedOptimizer
-from sw_gaussians.config import GaussianTraining
+from sw_gaussians.config import FUSED_FROM, GaussianTraining
 from sw_gaussians.fused_adam import FusingOptimizer
 from sw_gaussians.late_batches import BatchingOptimizer, SumViews
 from sw_gaussians.moments import keep_moments
@@ -49,9 +49,6 @@ if TYPE_CHECKING:
 
 READERS = (collect_statistics, fragments.collect_opacity_gradients)
 """Tasks that leave all gradients alone, and read none of spherical harmonics."""
-
-FUSED_FROM = 500_000
-"""Gaussians from which updates in the backward pass save time: of 250,000 a step takes as long, of a million 0.91."""
 
 AVERAGE_EVERY = 10
 """Steps between two samples of `fast.average`, fewer if it begins later: reading them takes a hundredth of a step."""
