@@ -42,13 +42,11 @@ PLANS = {
 def run(scene: str, methods: str, steps: int | None, rates: str, shared: list[str]) -> None:
     """Run rate points of some methods on a scene; a method that fails is told and left out.
 
-    shared  words of the command line that are those of all methods
+    shared  words of the command line that are those of all methods: the scene and more
     """
     starts, full = PLANS[methods]
-    path, images = split_scene(scene, load_plugins())
     own_rates = rates if methods in ("lightgaussian", "chimerags") else "all"
-    words = ["run", "--method", methods, "--rate", own_rates, "--scene", path, *shared]
-    words += ["--images", images] if images else []
+    words = ["run", "--method", methods, "--rate", own_rates, *shared]
     if steps is not None:
         own = ["scale_schedule=true", f"iterations={max(1, round(full * steps / FULL_STEPS))}"] if full else []
         before = ["pretrained.scale_schedule=true", f"pretrained.iterations={steps}"] if starts else []
@@ -109,9 +107,12 @@ def main() -> None:
     shared = ["--out", str(args.out), "--device", args.device]
     shared += ["--preset", args.preset] if args.preset else []
     shared += [word for value in args.set for word in ("--set", value)]
+    plugins = load_plugins()
     for scene in args.scenes:
+        path, images = split_scene(scene, plugins)
+        of_scene = ["--scene", path, *(["--images", images] if images else [])]
         for method in args.methods.split(","):
-            run(scene, names.get(method, method), args.steps, args.rates, shared)
+            run(scene, names.get(method, method), args.steps, args.rates, [*of_scene, *shared])
     found = rows(args.out)
     print_table(found)
     if args.json is not None:

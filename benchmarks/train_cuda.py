@@ -204,10 +204,11 @@ def main() -> None:
     args = parser.parse_args()
     if not torch.cuda.is_available():
         sys.exit("torch sees no CUDA device here")
-    print(device_reason("cuda", torch.device("cuda"), load_plugins()))
+    plugins = load_plugins()
+    print(device_reason("cuda", torch.device("cuda"), plugins))
     ratios = []
     for asked in args.scenes:
-        scene, pictures = split_scene(asked, load_plugins())
+        scene, pictures = split_scene(asked, plugins)
         mine = ours(scene, pictures or None, args, None)
         family, colon, folder = scene.rpartition(":")
         name = f"{family}{colon}{Path(folder).name} {pictures}".strip()  # read as another family, it is another scene
