@@ -50,7 +50,7 @@ for name in {modules}:
 from splatwizard_core.cli.main import main
 from splatwizard_native import InterruptGuard, available_cores
 assert available_cores() >= 1
-with InterruptGuard() as guard, guard.step():
+with InterruptGuard() as guard, guard.interruptible():
     pass
 sys.exit(main(["list-plugins"]))
 """

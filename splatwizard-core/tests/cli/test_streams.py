@@ -138,14 +138,59 @@ def test_a_request_to_end_is_heard_where_ctrl_c_is_ignored():
         signal.signal(signal.SIGINT, before)
 
 
-def test_a_request_to_end_waits_for_the_end_of_a_training_step():
-    with ended_like_ctrl_c(), InterruptGuard() as guard:
-        with guard.step():
-            os.kill(os.getpid(), signal.SIGTERM)
-            assert guard.pending
-        with pytest.raises(KeyboardInterrupt):
-            os.kill(os.getpid(), signal.SIGTERM)
+def end_this_process() -> None:
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+def test_a_request_to_end_waits_for_a_part_that_may_be_interrupted():
+    reached = []
+
+    def work() -> None:
+        with InterruptGuard() as guard:
+            with guard.interruptible():
+                reached.append("a part without one")
+            end_this_process()
+            reached.append("a step that is done whole")
+            with guard.interruptible():
+                reached.append("what is due after it")
+            reached.append("never")
+
+    with ended_like_ctrl_c(), pytest.raises(KeyboardInterrupt):
+        work()
+    assert reached == ["a part without one", "a step that is done whole", "what is due after it"]
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_a_request_to_end_after_the_last_such_part_is_heard_at_the_end():
+    reached = []
+
+    def work() -> None:
+        with InterruptGuard():
+            end_this_process()
+            reached.append("saved")
+
+    with ended_like_ctrl_c(), pytest.raises(KeyboardInterrupt):
+        work()
+    assert reached == ["saved"]
+
+
+def test_a_request_to_end_is_heard_at_once_where_it_may_be_and_the_second_time_anywhere():
+    heard = []
+
+    def work() -> None:
+        with InterruptGuard() as guard:
+            try:
+                with guard.interruptible():
+                    end_this_process()
+                    heard.append("late")
+            except KeyboardInterrupt:
+                heard.append("at once")
+                end_this_process()  # while what is whole is saved, say
+                heard.append("late")
+
+    with ended_like_ctrl_c(), pytest.raises(KeyboardInterrupt):
+        work()
+    assert heard == ["at once"]
 
 
 def test_progress_that_nobody_reads_does_not_end_the_work():

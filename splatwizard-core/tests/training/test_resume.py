@@ -17,6 +17,7 @@ from splatwizard_core.training.checkpoint import CheckpointStore
 from splatwizard_core.training.params import OptimizationParams, PipelineParams
 from splatwizard_core.training.pipeline import TrainingStopped
 from splatwizard_core.training.scheduler import STOP, Scheduler
+from splatwizard_core.training.timing import LoopClock
 
 
 @pytest.fixture
@@ -158,6 +159,33 @@ def test_ctrl_c_between_steps_saves_too(toy, whole, tmp_path):
     resumed = toy.train(iterations=200, directory=tmp_path, on_step=lambda _, r: steps.append(r.step))
     assert steps[0] == 78
     assert resumed.model.digest() == whole.model.digest()
+
+
+@pytest.mark.parametrize("around", ["start", "stop"])
+@pytest.mark.parametrize("step", [12, 20])
+def test_ctrl_c_on_the_way_from_step_to_step_saves_too(toy, tmp_path, monkeypatch, around, step):
+    """The clock starts when all that was due is done, and stops before it."""
+    done, calls = [], []
+    own = getattr(LoopClock, around)
+
+    def interrupt(clock):
+        own(clock)
+        # The loop's own start comes before all steps.
+        calls.append(around)
+        if len(calls) == step + (around == "start"):
+            os.kill(os.getpid(), signal.SIGINT)
+
+    options = {"iterations": 20, "ppl": PipelineParams(log_every=1)}
+    with monkeypatch.context() as patch:
+        patch.setattr(LoopClock, around, interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            toy.train(directory=tmp_path / "a", on_step=lambda _, r: done.append(r.step), **options)
+    left = CheckpointStore(tmp_path / "a").newest()
+    assert left is not None
+    assert left.step == done[-1] == min(20, step + (around == "start"))
+    resumed = toy.train(directory=tmp_path / "a", **options)
+    assert resumed.model.digest() == toy.train(directory=tmp_path / "b", **options).model.digest()
+    assert (tmp_path / "a" / "log.jsonl").read_text() == (tmp_path / "b" / "log.jsonl").read_text()
 
 
 def test_ctrl_c_after_the_last_step_leaves_a_finished_stage(toy, tmp_path):
@@ -427,10 +455,10 @@ def test_a_run_without_a_directory_writes_nothing(toy, tmp_path, monkeypatch):
 
 def test_times_and_steps_add_up_over_processes(toy, tmp_path):
     with pytest.raises(TrainingStopped):
-        toy.train(iterations=60, directory=tmp_path, stop_after=30, ppl=PipelineParams(profile="stages"))
-    part = json.loads((tmp_path / "00-0000030.json").read_text())["content"]["progress"]
+        toy.train(iterations=60, directory=tmp_path, stop_after=59, ppl=PipelineParams(profile="stages"))
+    part = json.loads((tmp_path / "00-0000059.json").read_text())["content"]["progress"]
     outcome = toy.train(iterations=60, directory=tmp_path, ppl=PipelineParams(profile="stages"))
-    assert part["stage_steps"] == {"toy": 30}
+    assert part["stage_steps"] == {"toy": 59}
     assert outcome.train_s > part["stage_seconds"]["toy"] > 0
     assert outcome.breakdown["toy"]["render"] > part["breakdown"]["toy"]["render"] > 0
     assert outcome.steps == 60

@@ -1,4 +1,4 @@
-"""Ctrl-C, or what is treated like it, waits for the end of a training step, so that what is saved is whole."""
+"""Ctrl-C, or what is treated like it, waits for a place where the state is whole, so that what is saved is."""
 
 from __future__ import annotations
 
@@ -16,16 +16,17 @@ ASKED_TO_END = [n for name in ("SIGINT", "SIGTERM", "SIGHUP") if (n := getattr(s
 
 
 class InterruptGuard:
-    """While installed, a Ctrl-C inside `with guard.step():` only sets `pending`; a second one, or one outside, raises.
+    """While installed, a Ctrl-C waits for the end of the next `with guard.interruptible():`, or of the guard itself.
 
+    Inside such a part it is raised at once, and so is a second one anywhere.
     It is installed in the main thread only, and only over Python's own handler: whoever handles SIGINT in a way of
     their own, or ignores it, goes on doing so. Where that handler was also given to SIGTERM or SIGHUP, those wait too.
     In any other case it does nothing.
     """
 
     def __init__(self) -> None:
-        self.pending = False
-        self._busy = False
+        self._pending = False
+        self._open = False
         self._taken: list[int] = []
 
     def __enter__(self) -> InterruptGuard:
@@ -36,22 +37,29 @@ class InterruptGuard:
                     self._taken.append(number)
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         while self._taken:
             signal.signal(self._taken.pop(), signal.default_int_handler)
+        if kind is None:
+            self._raise_pending()
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self._busy and not self.pending:
-            self.pending = True
-            log.warning("interrupted: finishing this step and saving a checkpoint (Ctrl-C again to stop at once)")
-            return
-        raise KeyboardInterrupt
+        waits = not (self._open or self._pending)
+        self._pending = True
+        if not waits:
+            raise KeyboardInterrupt
+        log.warning("interrupted: finishing this step and saving a checkpoint (Ctrl-C again to stop at once)")
+
+    def _raise_pending(self) -> None:
+        if self._pending:
+            raise KeyboardInterrupt
 
     @contextmanager
-    def step(self) -> Iterator[None]:
-        """Mark the part in which an interrupt waits."""
-        self._busy = True
+    def interruptible(self) -> Iterator[None]:
+        """Mark a part in which the state is whole: an interrupt that comes is raised, one that waited at the end."""
+        self._open = True
         try:
             yield
+            self._raise_pending()
         finally:
-            self._busy = False
+            self._open = False

@@ -68,13 +68,13 @@ class Housekeeping:
 
     @contextmanager
     def around(self) -> Iterator[None]:
-        """The loop, timed and on display; a Ctrl-C waits for the end of its step."""
+        """The loop, timed and on display."""
         run, trainer = self.run, self.trainer
         label = f"train {run.identity.get('method', self.name)}"
         if len(run.stages) > 1:
             label += f": {self.name} ({trainer.index + 1} of {len(run.stages)})"
         bar = track(label, total=trainer.stage.iterations, start=trainer.step, foretells=True)
-        with self.guard, bar as self._bar:
+        with bar as self._bar:
             self.clock.start()
             try:
                 yield
@@ -93,16 +93,15 @@ class Housekeeping:
         self.clock.stop()
         try:
             self._bar.advance(1, loss=record.total, **{model.ROW_LABEL: record.num_rows})
-            if run.on_step is not None:
-                with preserved_random_states():
-                    run.on_step(model, record)
             self._log_step(record)
-            if due and run.evaluate is not None:
-                self._evaluate(run.evaluate, record.step)
-            if not last and record.step % ppl.checkpoint_every == 0:
-                self.save()
-            if self.guard.pending:
-                raise KeyboardInterrupt
+            with self.guard.interruptible():
+                if run.on_step is not None:
+                    with preserved_random_states():
+                        run.on_step(model, record)
+                if due and run.evaluate is not None:
+                    self._evaluate(run.evaluate, record.step)
+                if not last and record.step % ppl.checkpoint_every == 0:
+                    self.save()
         except KeyboardInterrupt:
             # Between steps the state is whole, so nothing that is done is lost. After the last one the stage is
             # over: a resumed run must neither train past a STOP nor find that there is nothing to do.

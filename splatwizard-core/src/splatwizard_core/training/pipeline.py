@@ -171,13 +171,12 @@ class TrainingRun:
         return trainer.stage.finish(trainer.model, self.scene)
 
     def _resumed(self, saved: Checkpoint) -> Trainer:
-        """`_restore`, and what the record has accumulated."""
-        trainer = self._restore(saved)
+        """`_restore`, and what the record has accumulated, which the trainer's clock goes on from."""
         try:
             self.progress = Progress(**saved.progress)
         except TypeError as error:
             raise DamagedCheckpointError(f"the checkpoint of step {saved.step} is damaged: {error}") from error
-        return trainer
+        return self._restore(saved)
 
     def _restore(self, saved: Checkpoint) -> Trainer:
         """Return the trainer of a checkpoint's stage as it was after the checkpoint's step. Raises CheckpointError."""
@@ -220,16 +219,20 @@ class TrainingRun:
         stop_after = self.stop_after
         until = iterations if stop_after is None else min(iterations, stop_after - before)
         housekeeping = Housekeeping(self, trainer, name)
-        if iterations and (until > trainer.step or stop_after is None):  # a method that only encodes has no steps
+        trains = iterations and (until > trainer.step or stop_after is None)  # a method that only encodes has no steps
+        if trains:
             decode_all(self.scene.train)  # reading pictures is not training time
             self.progress.pictures_in = "cuda" if keep_pictures(self.scene.train, trainer.device) else "host"
-            try:
-                with housekeeping.around():
-                    trainer.run(until, housekeeping.after_step, housekeeping.guard)
-            finally:
-                keep_pictures(self.scene.train, "cpu")
-        finished = trainer.stopped or trainer.step >= iterations
-        housekeeping.save(finished=finished)
+        # A Ctrl-C waits for the end of its step, and one after the last step until that is saved.
+        with housekeeping.guard:
+            if trains:
+                try:
+                    with housekeeping.around():
+                        trainer.run(until, housekeeping.after_step)
+                finally:
+                    keep_pictures(self.scene.train, "cpu")
+            finished = trainer.stopped or trainer.step >= iterations
+            housekeeping.save(finished=finished)
         done, last = before + trainer.step, finished and index == len(self.stages) - 1
         if stop_after is not None and done >= stop_after and not last:
             raise TrainingStopped(f"stopped after step {done}; run again to go on")

@@ -30,7 +30,6 @@ from splatwizard_core.training.tasks import TaskContext
 from splatwizard_core.training.timing import StageClock
 from splatwizard_native import (
     DeviceMemoryError,
-    InterruptGuard,
     Verdict,
     capture_random_states,
     out_of_memory,
@@ -106,7 +105,7 @@ class Trainer:
         self._unchecked: list[StepRecord] = []
         self._asked: tuple[Verdict, list[StepRecord]] | None = None
 
-    def run(self, until: int, after_step: Callable[[StepRecord], None], guard: InterruptGuard | None = None) -> None:
+    def run(self, until: int, after_step: Callable[[StepRecord], None]) -> None:
         """Run the steps after `self.step` up to `until`, or to the one after which a task wants to stop.
 
         after_step  housekeeping, called between steps, when the state is whole
@@ -118,17 +117,15 @@ class Trainer:
                 f"stage '{self.stage.name}' ends at step {self.stage.iterations}, and {self.step} steps are done: "
                 "raise `iterations` to train on"
             )
-        guard = guard or InterruptGuard()
         while self.step < min(until, self.stage.iterations) and not self.stopped:
-            with guard.step():
-                try:
-                    record = self._run_step(self.step + 1)
-                except (EmptyModel, TaskError):
-                    self.check_losses()  # what a step with a loss that is not finite leaves behind may have caused it
-                    raise
-                except torch.cuda.OutOfMemoryError as error:
-                    raise self._out_of_memory(error) from error
-                self.step += 1
+            try:
+                record = self._run_step(self.step + 1)
+            except (EmptyModel, TaskError):
+                self.check_losses()  # what a step with a loss that is not finite leaves behind may have caused it
+                raise
+            except torch.cuda.OutOfMemoryError as error:
+                raise self._out_of_memory(error) from error
+            self.step += 1
             after_step(record)
         self.check_losses()
 
