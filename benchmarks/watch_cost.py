@@ -160,13 +160,13 @@ def train(blocks: Blocks, steps: int) -> None:
 
     run = Trainer.run
 
-    def measured(self: Trainer, until: int, after_step: Callable[[Any], None], *rest: Any) -> None:
+    def measured(self: Trainer, until: int, after_step: Callable[[Any], None]) -> None:
         def after(record: Any) -> None:
             after_step(record)
             blocks.unit_done()
 
         blocks.begin_anew()
-        run(self, until, after, *rest)
+        run(self, until, after)
 
     Trainer.run = measured  # type: ignore[method-assign]
     with tempfile.TemporaryDirectory() as folder:
