@@ -223,7 +223,7 @@ def run(jobs: Sequence[Job], out: Path | None, at_once: int) -> list[dict[str, A
                 file.write(json.dumps(line) + "\n")
 
     missing = [job for job in jobs if json.dumps(job.key, sort_keys=True) not in results]
-    if at_once == 1 and all(job.device != "cpu" for job in missing):  # gsplat's trainer, too
+    if at_once == 1 and all(job.device != "cpu" for job in missing):
         for job in missing:
             keep(job, trained(job) if job.variant.preset else trained_by_gsplat(job))
     else:
