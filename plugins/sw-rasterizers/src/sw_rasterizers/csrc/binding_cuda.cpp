@@ -82,16 +82,21 @@ sw::cuda::Rendered sw::cuda::render_on_cuda(const Inputs& in, at::ArrayRef<doubl
   image.median_splat = data<int32_t>(saved[kMedianSplat]);
   const int64_t tiles = int64_t(view.tiles_x()) * view.tiles_y();
   const bool few = !fast && !general && !count_work && tiles < kFewTiles;
-  if (few && save && !(in.flags & kForScores) && tally.pairs() > 0) {
+  const bool cut = few && save && !(in.flags & kForScores) && tally.pairs() > 0;
+  const bool split = few && tiles < kSplitTiles && tally.pairs() > 0;
+  Tensor behind, scratch;
+  if (cut || split) {
     const int64_t pieces = piece_count(tiles, tally.pairs());
-    saved[kBehind] = make({pieces, kTile * kTile, 4}), saved[kWhere] = make_as({pieces, 2}, at::kInt);
-    image.pieces = {data<float4>(saved[kBehind]), data<int2>(saved[kWhere]), pieces};
+    behind = make({pieces, kTile * kTile, 4});
+    if (split) scratch = make_as({int64_t(few_scratch(tiles, pieces))}, at::kByte);
+    if (cut) saved[kBehind] = behind, saved[kWhere] = make_as({pieces, 2}, at::kInt);
+    image.pieces = {data<float4>(behind), data<int2>(saved[kWhere]), pieces};
   }
   if (fast)
     (in.flags & kFlash ? blend_flash : blend_tcgs)(view, binned.drawn, binned.lists(), image,
                                                    as_bytes ? data<uint8_t>(picture) : nullptr, stream);
   else if (few)
-    blend_few(view, binned.drawn, binned.lists(), image, stream);
+    blend_few(split ? scratch.data_ptr() : nullptr, view, binned.drawn, binned.lists(), image, stream);
   else
     blend(view, binned.drawn, binned.lists(), image, general, count_work ? tally.counters : nullptr,
           binned.sorted_depth, stream);

@@ -17,12 +17,12 @@ SW_HD V log2_alpha(V dx, V dy, V a, V b, V c, V level) {
 }
 
 // Front to back: takes alpha (0 where the splat is skipped), updates the transmittance, returns the weight alpha T,
-// which is 0 where the pixel is or becomes finished.
+// which is 0 where the pixel is or becomes finished: below `least`, another one where both are relative to a start.
 template <class V>
-SW_HD V composite(V alpha, V& transmittance) {
+SW_HD V composite(V alpha, V& transmittance, V least = constant<V>(kTransmittanceMin)) {
   const V zero = constant<V>(0);
   const V weight = alpha * transmittance, next = transmittance - weight;
-  const auto live = next >= constant<V>(kTransmittanceMin);
+  const auto live = next >= least;
   transmittance = select(live, next, -absolute(transmittance));
   return select(live, weight, zero);
 }

@@ -80,8 +80,12 @@ constexpr int kFewTiles = 3000, kPiece = 256;
 SW_HD int64_t first_piece(int tile, int start) { return int64_t(start) / kPiece + tile; }
 inline int64_t piece_count(int64_t tiles, int64_t pairs) { return pairs / kPiece + tiles; }
 
+// Below this many tiles the forward pass shares out the pieces, too (blend_few.cu); 0: a block a tile always.
+constexpr int kSplitTiles = 1000;
+
 struct Pieces {
-  float4* behind;  // [pieces][kTile^2] by warp and lane of `blend_few`: transmittance at a piece's end, colours behind it
+  float4* behind;  // [pieces][kTile^2] by warp and lane of `blend_few`: transmittance at a piece's end, colours behind it;
+                   // not cut: scratch of a forward pass that shares out pieces
   int2* where;     // [pieces] tile and first list position, or -1 if no pixel got that far; null: not cut
   int64_t count;
 };
@@ -157,7 +161,9 @@ void number_keys(int64_t count, const int32_t* keys, uint32_t none, uint32_t* to
 
 void blend(const View<float>& view, const Splats& splats, const TileLists& lists, const Image& image,
            bool general, Counters* counters, const uint32_t* depth, cudaStream_t stream);
-void blend_few(const View<float>& view, const Splats& splats, const TileLists& lists, const Image& image,
+// `scratch` null: a block a tile. Else pieces are shared out: image.pieces has `behind` and `count`, cut or not.
+size_t few_scratch(int64_t tiles, int64_t pieces);
+void blend_few(void* scratch, const View<float>& view, const Splats& splats, const TileLists& lists, const Image& image,
                cudaStream_t stream);
 // Into image.image, or into `bytes` [3][H][W] as 8-bit levels if that is not null; and image.alpha.
 void blend_flash(const View<float>& view, const Splats& splats, const TileLists& lists, const Image& image,
