@@ -54,7 +54,8 @@ PHASES = (
     ("project_backward_kernel", "gradients of inputs"), ("project_kernel", "project"), ("shade_kernel", "shade"),
     ("sum_groups", "blend backward"), ("photometric", "loss"), ("splatwizard::cuda", ""), ("emit_kernel", "emit"),
     ("find_tiles", "emit"), ("number_kernel", "blend backward"), ("Radix", "sort"), ("radix", "sort"),
-    ("few_kernel", "blend"), ("blend_kernel", "blend"), ("backward_kernel", "blend backward"),
+    ("few_kernel", "blend"), ("split_kernel", "blend"), ("blend_kernel", "blend"),
+    ("backward_kernel", "blend backward"),
     ("Memset", "clears and copies"), ("Memcpy", "clears and copies"), ("fill", "clears and copies"),
 )  # fmt: skip
 OF_TRAINING = (

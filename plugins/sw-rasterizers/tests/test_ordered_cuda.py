@@ -37,6 +37,10 @@ CASES = {
     "plain": (RasterOptions(grad2d=True), {}),
     "absgrad": (RasterOptions(absgrad=True, alpha=True), {}),
     "depths": (RasterOptions(alpha=True, depth=ALL_DEPTHS, grad2d=True, absgrad=True), {}),
+    "long": (  # lists of 2,000 to 5,000, whose pieces any block may take
+        RasterOptions(grad2d=True),
+        {"n": 20_000, "width": 70, "height": 50, "spread": 1.0, "scale": (0.02, 0.3), "opacity": (0.005, 0.05)},
+    ),
     "large": (RasterOptions(grad2d=True), {"width": 900, "height": 900}),  # whole lists: 3,249 tiles
     "fragments": (RasterOptions(grad2d=True, fragment_grad=True), {}),
     "features": (RasterOptions(), {"features": 11}),
