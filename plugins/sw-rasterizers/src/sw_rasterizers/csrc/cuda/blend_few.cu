@@ -215,8 +215,8 @@ __device__ __forceinline__ float least_passed(float transmittance) {
   return __fdiv_rn(float(kTransmittanceMin), transmittance);
 }
 
-// By all lanes of a warp: transmittance where `piece` of a tile starts, -1: finished. `passed`: the pixel's words of the
-// tile. Products are taken from the front, whoever takes them: equal bits. Without `wait`, returns false if a piece
+// By all lanes of a warp: transmittance where `piece` of a tile starts, -1: finished. `passed`: the pixel's words of
+// the tile. Products are taken from the front, whoever takes them: equal bits. Without `wait`, returns false if a piece
 // before this one has not come so far; -1 is right even then.
 __device__ __forceinline__ bool find_start(const unsigned* passed, int piece, bool wait, float& transmittance) {
   unsigned word[kWindow];
@@ -354,8 +354,9 @@ __global__ void __launch_bounds__(kThreads, kSplitBlocks)
     const float end = drawn ? __fmul_rn(start, fabsf(transmittance)) : 0.f;
     store_passed(passed + int64_t(piece) * kThreads,
                  __float_as_uint(end) | kFromFront | (going_on ? 0u : kFinished));
+    const float scale = drawn ? start : 0.f;
     image.pieces.behind[(place + piece) * kThreads + thread] =
-        drawn ? make_float4(end, start * color[0], start * color[1], start * color[2]) : make_float4(0.f, 0.f, 0.f, 0.f);
+        make_float4(end, scale * color[0], scale * color[1], scale * color[2]);
     if (image.last != nullptr && drawn && last > 0) atomicMax(shared.last + int64_t(tile) * kThreads + thread, last);
     __threadfence();
     if (!__syncthreads_or(drawn)) continue;  // an earlier piece was the last

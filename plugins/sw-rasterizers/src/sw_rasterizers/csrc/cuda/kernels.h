@@ -84,8 +84,8 @@ inline int64_t piece_count(int64_t tiles, int64_t pairs) { return pairs / kPiece
 constexpr int kSplitTiles = 1000;
 
 struct Pieces {
-  // [pieces][kTile^2] by warp and lane of `blend_few`: transmittance at a piece's end, colours behind it. Where nothing is
-  // cut, memory of a forward pass that shares out pieces.
+  // [pieces][kTile^2] by warp and lane of `blend_few`: transmittance at a piece's end, colours behind it. Where
+  // nothing is cut, memory of a forward pass that shares out pieces.
   float4* behind;
   int2* where;     // [pieces] tile and first list position, or -1 if no pixel got that far; null: not cut
   int64_t count;
