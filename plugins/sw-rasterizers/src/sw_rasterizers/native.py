@@ -13,6 +13,7 @@ MODULE = NativeModule(
         "csrc/binding_scores.cpp",
         "csrc/binding_shared.cpp",
         "csrc/binding_cuda.cpp",
+        "csrc/binding_draw_cuda.cpp",
         "csrc/binding_scores_cuda.cpp",
         "csrc/binding_surfel_cuda.cpp",
         "csrc/binding_shared_cuda.cpp",

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.api import Camera, GradBuffer
-from splatwizard_native import AdamUpdate, end_offer, offered_update
+from splatwizard_native import offered_update
 from sw_rasterizers.native import MODULE
 
 INPUTS = (
@@ -66,7 +66,7 @@ class Call:
 
     camera          18 numbers: R, tau, fx, fy, cx, cy, near, far
     geom_indices    [N] int64, rows of scales and quats, none outside: the kernels do not look
-    seconds         stage -> seconds, filled by the forward and by the backward pass
+    seconds         stage -> seconds, filled by the forward pass, on the CPU also by the backward pass
     counts          visible Gaussians, (splat, tile) pairs, evaluated and blended pixel-splat pairs (-1 unless counted),
                     inputs that are not finite
     """
@@ -85,11 +85,6 @@ class Call:
     absgrad2d: GradBuffer | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     counts: list[int] = field(default_factory=list)
-    channels: tuple[int, int] = (3, 0)  # colours and features, for the backward pass on CUDA
-    drawn: _Drawn | None = None  # on its way from one node to the next
-    updates: dict[str, tuple[Tensor, AdamUpdate]] = field(
-        default_factory=dict
-    )  # that the backward pass may do, on CUDA
 
     def settings(self) -> tuple[Any, ...]:
         return self.camera, self.width, self.height, self.sh_degree, self.scale_modifier, self.eps2d, int(self.flags)
@@ -135,92 +130,19 @@ class _Rasterize(torch.autograd.Function):
         return _hand_out(call, found, wanted)
 
 
-class _Project(torch.autograd.Function):
-    """On CUDA, first of two nodes: (call, dummy, *INPUTS) -> a stand-in [N, sums of a Gaussian] without memory.
-
-    Its gradient is what `_Blend` sums up over the pixels. Two nodes, because what `_Blend` kept is then freed before
-    this one allocates the gradients of the inputs.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, call: Call, dummy: Tensor | None, *inputs: Tensor | None) -> Tensor:
-        tensors = [None if x is None else x.detach().contiguous() for x in inputs]
-        call.drawn = _draw(call, tensors)
-        ctx.call = call
-        ctx.set_materialize_grads(False)
-        ctx.present = [x is not None for x in tensors]
-        call.drawn.saved, flags = call.drawn.saved[:-1], call.drawn.saved[-1]
-        ctx.save_for_backward(*(x for x in tensors if x is not None), flags)
-        means = tensors[0]
-        assert means is not None
-        sums = 6 + _channels(tensors, call.flags) + 2 * (Flag.ABSGRAD in call.flags) + (Flag.MEDIAN_DEPTH in call.flags)
-        call.channels = _color_channels(tensors), _feature_channels(tensors)
-        return means.new_empty(1, 1).expand(means.shape[0], sums)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, rows: Tensor) -> tuple[Tensor | None, ...]:
-        call: Call = ctx.call
-        *stored, flags = ctx.saved_tensors
-        tensors = [stored.pop(0) if present else None for present in ctx.present]
-        wanted = [*ctx.needs_input_grad[2:], call.grad2d is not None, call.absgrad2d is not None]
-        updated, rates = _updates(call, wanted)
-        found, seconds = torch.ops.sw_rasterizers.project_backward(
-            *tensors, call.geom_indices, *call.settings(), flags, rows.contiguous(), wanted, updated, rates
-        )
-        call.seconds.update(zip(BACKWARD_STAGES[1:], seconds, strict=False))
-        for param, _ in call.updates.values():
-            end_offer(param)
-            torch.autograd.graph.increment_version(param)  # the kernel writes behind autograd's back
-        return _hand_out(call, found, wanted)
-
-
-class _Blend(torch.autograd.Function):
-    """On CUDA, second of two nodes: (call, stand-in) -> the outputs of `_Rasterize`."""
-
-    @staticmethod
-    def forward(ctx: Any, call: Call, stand_in: Tensor) -> tuple[Tensor, ...]:
-        drawn = call.drawn
-        assert drawn is not None
-        call.drawn = None
-        ctx.call, ctx.gaussians = call, stand_in.shape[0]
-        ctx.mark_non_differentiable(drawn.radii)
-        ctx.set_materialize_grads(False)
-        ctx.save_for_backward(*drawn.saved)
-        return drawn.image, drawn.radii, drawn.alpha, drawn.median
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        image, _, alpha, median = grads
-        call: Call = ctx.call
-        saved = list(ctx.saved_tensors)
-        if image is None:
-            colors, features = call.channels
-            depths = (Flag.INVERSE_DEPTH in call.flags) + (Flag.ACCUMULATED_DEPTH in call.flags)
-            image = saved[0].new_zeros(colors + depths + features, call.height, call.width)
-        rows, seconds = torch.ops.sw_rasterizers.blend_backward(
-            saved, call.background, call.camera, call.width, call.height, ctx.gaussians, *call.channels,
-            int(call.flags), image.contiguous(), _nonempty(alpha), _nonempty(median),
-        )  # fmt: skip
-        call.seconds.update(zip(BACKWARD_STAGES, seconds, strict=False))
-        return None, rows
-
-
-def _updates(call: Call, wanted: list[bool]) -> tuple[list[Tensor], list[float]]:
-    """Tensors and rates of the updates that the kernel does, of sh_dc, of sh_rest; no gradient of theirs is wanted."""
-    if not call.updates:
+def _updates(tensors: dict[str, Tensor | None]) -> tuple[list[Tensor], list[float]]:
+    """Tensors and rates of the updates that the backward pass on CUDA is to do, of sh_dc, of sh_rest; or nothing."""
+    waiting = [None if (param := tensors.get(name)) is None else (param, offered_update(param)) for name in UPDATED]
+    if all(entry is None or entry[1] is None for entry in waiting):
         return [], []
-    tensors: list[Tensor] = []
+    updated: list[Tensor] = []
     rates: list[float] = []
-    for name in UPDATED:
-        if name not in call.updates:
-            tensors += [torch.empty(0)] * 3
+    for entry in waiting:
+        if entry is None or (u := entry[1]) is None:
+            updated += [torch.empty(0)] * 3
             rates += [0.0] * 6
             continue
-        _, u = call.updates[name]
-        wanted[INPUTS.index(name)] = False
-        tensors += [u.param, u.exp_avg, u.exp_avg_sq]
+        updated += [entry[0], u.exp_avg, u.exp_avg_sq]
         rates += [
             u.lr / (1 - u.beta1**u.step),
             1 - u.beta1,
@@ -229,7 +151,25 @@ def _updates(call: Call, wanted: list[bool]) -> tuple[list[Tensor], list[float]]
             1 / math.sqrt(1 - u.beta2**u.step),
             u.eps,
         ]
-    return tensors, rates
+    return updated, rates
+
+
+def _draw_on_cuda(call: Call, tensors: dict[str, Tensor | None]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Draw with gradients on CUDA, where the nodes of autograd are in C++ (csrc/binding_draw_cuda.cpp)."""
+    image, radii, alpha, median, call.counts, seconds, late = torch.ops.sw_rasterizers.draw(
+        *map(tensors.get, INPUTS), call.geom_indices, call.visible, call.background, *call.settings(),
+        call.grad2d is not None, call.absgrad2d is not None, *_updates(tensors),
+    )  # fmt: skip
+    call.seconds.update(zip(FORWARD_STAGES, seconds, strict=False))
+    for buffer in (call.grad2d, call.absgrad2d):
+        if buffer is not None:
+            buffer.set(late.pop(0))
+    return image, radii, alpha, median
+
+
+def backward_seconds() -> dict[str, float]:
+    """Seconds of each stage of the last backward pass of a counting rasterizer on CUDA."""
+    return dict(zip(BACKWARD_STAGES, torch.ops.sw_rasterizers.backward_seconds(), strict=False))
 
 
 def _hand_out(call: Call, found: list[Tensor], wanted: list[bool]) -> tuple[Tensor | None, ...]:
@@ -276,24 +216,18 @@ def rasterize(call: Call, tensors: dict[str, Tensor | None]) -> tuple[Tensor, Te
     """
     MODULE.load()
     inputs = [tensors.get(name) for name in INPUTS]
-    dummy = None
-    if torch.is_grad_enabled():
-        if call.grad2d is not None or call.absgrad2d is not None:
-            dummy = torch.empty(0, requires_grad=True)  # statistics are wanted even if no input needs a gradient
-        if dummy is not None or any(x is not None and x.requires_grad for x in inputs):
-            call.flags |= Flag.SAVE
-    means = tensors["means"]
-    assert means is not None
-    if Flag.SAVE not in call.flags:
+    recording = torch.is_grad_enabled()
+    differentiable = recording and any(x is not None and x.requires_grad for x in inputs)
+    if not differentiable and not (recording and (call.grad2d is not None or call.absgrad2d is not None)):
         drawn = _draw(call, [None if x is None else x.detach().contiguous() for x in inputs])
         return drawn.image, drawn.radii, drawn.alpha, drawn.median
+    call.flags |= Flag.SAVE
+    means = tensors["means"]
+    assert means is not None
     if means.is_cuda:
-        for name in UPDATED:
-            param = tensors.get(name)
-            update = None if param is None else offered_update(param)
-            if param is not None and update is not None:
-                call.updates[name] = param, update
-        return _Blend.apply(call, _Project.apply(call, dummy, *inputs))  # type: ignore[no-any-return]
+        return _draw_on_cuda(call, tensors)
+    # Statistics are wanted even if no input needs a gradient.
+    dummy = None if differentiable else torch.empty(0, requires_grad=True)
     return _Rasterize.apply(call, dummy, *inputs)  # type: ignore[no-any-return]
 
 

@@ -116,13 +116,13 @@ class GradBuffer:
     @property
     def value(self) -> Tensor:
         """[N,2] in NDC units. Raises RuntimeError before `backward`."""
-        if self._value is None:
+        if self._value is None or self._value.dim() == 1:
             raise RuntimeError("the screen-space gradient is only there after backward()")
         return self._value
 
     def set(self, value: Tensor) -> None:
-        """Store the gradient; the rasterizer's backward pass calls it once."""
-        self._value = value.detach()
+        """Store the gradient, or an empty [0] that the backward pass resizes; a rasterizer calls it once."""
+        self._value = value.detach() if value.requires_grad else value
 
 
 @dataclass

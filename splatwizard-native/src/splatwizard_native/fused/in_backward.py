@@ -16,21 +16,23 @@ from splatwizard_native.fused.adam import AdamUpdate
 
 
 def offer_update(param: Tensor, update: AdamUpdate) -> None:
-    """Let the next backward pass that has the gradient of `param` do this update; its `grad` is not looked at."""
+    """Let the next backward pass that has the gradient of `param` do this update; its `grad` is not looked at.
+
+    Whoever does it counts up the version of `param`, as every change in place does.
+    """
     holder: Any = param
-    holder.update_in_backward = update
+    holder.update_in_backward = update, param._version
 
 
 def offered_update(param: Tensor) -> AdamUpdate | None:
     """The update that waits at a parameter; None: none does."""
-    update: AdamUpdate | None = getattr(param, "update_in_backward", None)
-    return update
+    update, version = getattr(param, "update_in_backward", None) or (None, 0)
+    return update if version == param._version else None
 
 
 def end_offer(param: Tensor) -> bool:
     """Withdraw what was offered, or say that it is done; returns whether it still waited."""
     waits = offered_update(param) is not None
-    if waits:
-        holder: Any = param
-        holder.update_in_backward = None
+    holder: Any = param
+    holder.update_in_backward = None
     return waits

@@ -254,16 +254,6 @@ TORCH_LIBRARY(sw_rasterizers, m) {
       "float[] camera, int width, int height, int sh_degree, float scale_modifier, float eps2d, int flags, "
       "Tensor[] saved, Tensor image_gradient, Tensor? alpha_gradient, Tensor? median_gradient, bool[13] wanted) "
       "-> (Tensor[] gradients, float[] seconds)");
-  // On CUDA the two halves of render_backward are ops of their own; see binding_cuda.cpp.
-  m.def(
-      "blend_backward(Tensor[] saved, Tensor? background, float[] camera, int width, int height, int gaussians, "
-      "int color_channels, int feature_channels, int flags, Tensor image_gradient, Tensor? alpha_gradient, "
-      "Tensor? median_gradient) -> (Tensor rows, float[] seconds)");
-  m.def(
-      "project_backward(Tensor means, Tensor opacities, Tensor? scales, Tensor? quats, Tensor? cov3d, Tensor? sh, "
-      "Tensor? sh_dc, Tensor? sh_rest, Tensor? colors, Tensor? features, Tensor? scale_factors, Tensor? geom_indices, float[] camera, int width, int height, "
-      "int sh_degree, float scale_modifier, float eps2d, int flags, Tensor drawn, Tensor rows, bool[13] wanted, "
-      "Tensor(a!)[] updated, float[] rates) -> (Tensor[] gradients, float[] seconds)");
   m.def(
       "visible_radii(Tensor means, Tensor? scales, Tensor? quats, Tensor? cov3d, Tensor? scale_factors, Tensor? geom_indices, "
       "Tensor? visible, float[] camera, int width, int height, float scale_modifier, float eps2d) -> Tensor");

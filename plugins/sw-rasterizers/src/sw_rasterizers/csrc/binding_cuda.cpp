@@ -133,38 +133,40 @@ Rendered render(const Tensor& means, const Tensor& opacities, const OptionalTens
   return render_on_cuda(in, camera, width, height);
 }
 
-// Gradients in two ops, so that what the first one needs, the image's gradient and the lists, is free again before the
+}  // namespace
+
+// Gradients in two nodes, so that what the first one needs, the image's gradient and the lists, is free again before the
 // second one allocates the gradients of the inputs, which are larger than all else.
 //
-// rows: [N, row_length] sums of every Gaussian, zeros where it was not drawn.
-std::tuple<Tensor, std::vector<double>> blend_backward_on_cuda(
-    std::vector<Tensor> saved, const OptionalTensor& background, at::ArrayRef<double> camera, int64_t width,
-    int64_t height, int64_t gaussians, int64_t color_channels, int64_t feature_channels, int64_t flags,
-    const Tensor& image_gradient, const OptionalTensor& alpha_gradient, const OptionalTensor& median_gradient) {
+// Returns rows [N, row_length], sums of every Gaussian, zeros where it was not drawn.
+Tensor sw::cuda::blend_backward_on_cuda(const DrawCall& call, const std::vector<Tensor>& saved,
+                                        const Tensor& image_gradient, const OptionalTensor& alpha_gradient,
+                                        const OptionalTensor& median_gradient, std::vector<double>& seconds) {
   TORCH_CHECK(saved.size() == kSavedCount, "sw_rasterizers: the forward pass kept no state for the backward pass");
-  const Channels channels{int(color_channels), (flags & kInverseDepth) != 0, (flags & kAccumulatedDepth) != 0,
-                          int(feature_channels)};
-  for (const OptionalTensor* t : {&alpha_gradient, &median_gradient, &background})
+  const int64_t flags = call.flags, width = call.width, height = call.height, gaussians = call.gaussians;
+  const Channels channels = call.channels;
+  for (const OptionalTensor* t : {&alpha_gradient, &median_gradient})
     TORCH_CHECK(!t->has_value() || ((*t)->is_contiguous() && (*t)->device() == image_gradient.device()),
-                "sw_rasterizers: gradients and background must be contiguous and on one device");
+                "sw_rasterizers: gradients must be contiguous and on one device");
   TORCH_CHECK(image_gradient.is_contiguous() && image_gradient.scalar_type() == at::kFloat &&
                   image_gradient.sizes() == at::IntArrayRef({channels.total(), height, width}),
               "sw_rasterizers: the image's gradient must be contiguous float32 of shape [", channels.total(), ", ", height,
               ", ", width, "], got ", image_gradient.sizes());
   const c10::cuda::CUDAGuard guard(image_gradient.device());
   const cudaStream_t stream = c10::cuda::getCurrentCUDAStream();
-  const auto view = View<float>::from(camera.data(), int(width), int(height));
+  const auto view = View<float>::from(call.camera.data(), int(width), int(height));
   StageClock clock{(flags & kCount) != 0, stream, {}};
   clock.mark();
 
   const bool absgrad = flags & kAbsgrad, median = flags & kMedianDepth;
   const int length = row_length(channels.total(), absgrad, median);
-  const Tensor row_memory = at::zeros({gaussians, length}, image_gradient.options().requires_grad(false));
+  const Tensor row_memory = at::empty({gaussians, length}, image_gradient.options().requires_grad(false));
+  C10_CUDA_CHECK(cudaMemsetAsync(row_memory.data_ptr(), 0, row_memory.nbytes(), stream));
   const Rows rows{data<float>(row_memory), length, channels.total(), absgrad, median, (flags & kFragments) != 0};
   Image image{};
   image.channels = channels.total(), image.color_channels = channels.colors;
-  image.background = data<float>(background);
-  image.background_is_image = background.has_value() && background->dim() == 3;
+  image.background = data<float>(call.background);
+  image.background_is_image = call.background.has_value() && call.background->dim() == 3;
   image.transmittance = data<float>(saved[kTransmittance]), image.last = data<int32_t>(saved[kLast]);
   image.median_splat = data<int32_t>(saved[kMedianSplat]);
   image.pieces = {data<float4>(saved[kBehind]), data<int2>(saved[kWhere]), saved[kWhere].size(0)};
@@ -191,39 +193,37 @@ std::tuple<Tensor, std::vector<double>> blend_backward_on_cuda(
                    image, general, gradient, flags & kDetachFeatures ? channels.features : 0, rows, ordered, stream);
   C10_CUDA_KERNEL_LAUNCH_CHECK();
   clock.mark();
-  return {row_memory, clock.seconds()};
+  seconds = clock.seconds();
+  return row_memory;
 }
 
-std::tuple<std::vector<Tensor>, std::vector<double>> project_backward_on_cuda(
-    const Tensor& means, const Tensor& opacities, const OptionalTensor& scales, const OptionalTensor& quats,
-    const OptionalTensor& cov3d, const OptionalTensor& sh, const OptionalTensor& sh_dc, const OptionalTensor& sh_rest,
-    const OptionalTensor& colors, const OptionalTensor& features, const OptionalTensor& scale_factors,
-    const OptionalTensor& geom_indices, at::ArrayRef<double> camera, int64_t width, int64_t height, int64_t sh_degree,
-    double scale_modifier, double eps2d, int64_t flags, const Tensor& drawn,
-    const Tensor& row_memory, std::array<bool, kWantedCount> wanted, const std::vector<Tensor>& updated,
-    at::ArrayRef<double> rates) {
-  const OptionalTensor none;
-  const Inputs in{means,    opacities, scales, quats,     cov3d,          sh,    sh_dc, sh_rest, colors,
-                  features, none,      none,   sh_degree, scale_modifier, eps2d, flags, 3,  scale_factors,
-                  geom_indices};
+// Returns the gradients in the order of Wanted, undefined where none is wanted; those by the projected centres go into
+// the tensors of `call`, whose updates are done.
+std::vector<Tensor> sw::cuda::project_backward_on_cuda(const Inputs& in, const DrawCall& call, const Tensor& drawn,
+                                                       const Tensor& row_memory, std::array<bool, kWantedCount> wanted,
+                                                       std::vector<double>& seconds) {
   in.check();
   check_placement(in);
+  const Tensor& means = in.means;
   const auto channels = in.channels();
+  const int64_t flags = call.flags, n = means.size(0);
   const bool absgrad = flags & kAbsgrad, median = flags & kMedianDepth;
   const int length = row_length(channels.total(), absgrad, median);
-  const int64_t n = means.size(0);
   in.check_shape("rows", row_memory, {n, length});
   in.check_shape("drawn", drawn, {n});
   const c10::cuda::CUDAGuard guard(means.device());
   const cudaStream_t stream = c10::cuda::getCurrentCUDAStream();
-  const auto view = View<float>::from(camera.data(), int(width), int(height));
+  const auto view = View<float>::from(call.camera.data(), int(call.width), int(call.height));
   const auto g = in.gaussians<float>();
   const auto real = means.options().requires_grad(false);
   StageClock clock{(flags & kCount) != 0, stream, {}};
   clock.mark();
 
-  std::vector<Tensor> grads(kWantedCount, at::empty({0}, real));
-  const bool shared = geom_indices.has_value();  // then the rows of shapes are summed up, starting at 0
+  const std::vector<Tensor>& updated = call.updated;
+  for (const int i : {0, 1})
+    if (!updated.empty() && updated[3 * i].numel() > 0) wanted[i == 0 ? kWantShDc : kWantShRest] = false;
+  std::vector<Tensor> grads(kWantedCount);
+  const bool shared = in.geom_indices.has_value();  // then the rows of shapes are summed up, starting at 0
   const auto want = [&](int which, const OptionalTensor& like) {
     if (wanted[which] && like.has_value())
       grads[which] = shared && (which == kWantScales || which == kWantQuats) ? at::zeros(like->sizes(), real)
@@ -249,15 +249,10 @@ std::tuple<std::vector<Tensor>, std::vector<double>> project_backward_on_cuda(
   out.colors = want(kWantColors, in.colors);
   out.features = want(kWantFeatures, in.features);
   out.scale_factors = want(kWantScaleFactors, in.scale_factors);
-  const auto screen = [&](int which) {
-    if (wanted[which]) grads[which] = at::empty({n, 2}, real);
-    return data<float>(grads[which]);
-  };
-  out.grad2d = screen(kWantGrad2d);
-  out.absgrad2d = screen(kWantAbsgrad2d);
+  const auto screen = [&](const Tensor& late) { return late.defined() ? data<float>(late.resize_({n, 2})) : nullptr; };
+  out.grad2d = screen(call.grad2d);
+  out.absgrad2d = screen(call.absgrad2d);
   const Rows rows{data<float>(row_memory), length, channels.total(), absgrad, median, (flags & kFragments) != 0};
-  TORCH_CHECK(updated.size() == 0 || (updated.size() == 6 && rates.size() == 12),
-              "sw_rasterizers: Adam in the backward pass takes three tensors and six numbers for each of sh_dc, sh_rest");
   ShAdam adam{};
   for (size_t i = 0; i < updated.size(); i += 3) {
     const OptionalTensor& like = i == 0 ? in.sh_dc : in.sh_rest;
@@ -269,7 +264,7 @@ std::tuple<std::vector<Tensor>, std::vector<double>> project_backward_on_cuda(
                       updated[k].scalar_type() == at::kFloat && updated[k].device() == means.device() &&
                       reinterpret_cast<uintptr_t>(updated[k].data_ptr()) % 16 == 0,
                   "sw_rasterizers: parameter and moments must be contiguous float32 of shape ", like->sizes());
-    const double* r = rates.data() + 2 * i;
+    const double* r = call.rates.data() + 2 * i;
     RowAdam& of = i == 0 ? adam.dc : adam.rest;
     of = RowAdam{data<float>(updated[i]), data<float>(updated[i + 1]), data<float>(updated[i + 2]),
                  float(r[0]), float(r[1]), float(r[2]), float(r[3]), float(r[4]), float(r[5])};
@@ -277,8 +272,11 @@ std::tuple<std::vector<Tensor>, std::vector<double>> project_backward_on_cuda(
   if (n > 0) project_backward(view, g, in.settings(), channels, data<uint8_t>(drawn), rows, out, adam, stream);
   C10_CUDA_KERNEL_LAUNCH_CHECK();
   clock.mark();
-  return {std::move(grads), clock.seconds()};
+  seconds = clock.seconds();
+  return grads;
 }
+
+namespace {
 
 Tensor visible_radii_on_cuda(const Tensor& means, const OptionalTensor& scales, const OptionalTensor& quats,
                              const OptionalTensor& cov3d, const OptionalTensor& scale_factors,
@@ -306,8 +304,6 @@ Tensor visible_radii_on_cuda(const Tensor& means, const OptionalTensor& scales, 
 
 TORCH_LIBRARY_IMPL(sw_rasterizers, CUDA, m) {
   m.impl("render", render);
-  m.impl("blend_backward", blend_backward_on_cuda);
-  m.impl("project_backward", project_backward_on_cuda);
   m.impl("visible_radii", visible_radii_on_cuda);
 }
 

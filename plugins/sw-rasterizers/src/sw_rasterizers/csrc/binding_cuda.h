@@ -2,12 +2,14 @@
 #pragma once
 
 #include <ATen/core/Tensor.h>
+#include <ATen/core/ivalue.h>
 #include <ATen/ops/empty.h>
 #include <c10/cuda/CUDAException.h>
 #include <c10/cuda/CUDAGuard.h>
 #include <c10/cuda/CUDAStream.h>
 
 #include <algorithm>
+#include <array>
 #include <bit>
 #include <limits>
 #include <tuple>
@@ -298,5 +300,26 @@ class Grouped {
 using Rendered = std::tuple<Tensor, Tensor, Tensor, Tensor, std::vector<Tensor>, std::vector<int64_t>,
                             std::vector<double>>;
 Rendered render_on_cuda(const Inputs& in, at::ArrayRef<double> camera, int64_t width, int64_t height);
+
+// Everything of one call that is not a tensor to differentiate by, and what its backward pass leaves and does.
+struct DrawCall : torch::CustomClassHolder {
+  std::vector<double> camera;
+  int64_t width, height, sh_degree;
+  double scale_modifier, eps2d;
+  int64_t flags;
+  OptionalTensor geom_indices, visible, background;
+  int64_t gaussians = 0;
+  Channels channels{};
+  Tensor grad2d, absgrad2d;      // [0] until the backward pass makes them [N,2]; undefined: not wanted
+  std::vector<Tensor> updated;   // parameter and moments of sh_dc, of sh_rest (empty tensors: not this one), or nothing
+  std::vector<double> rates;     // six numbers for each
+};
+
+Tensor blend_backward_on_cuda(const DrawCall& call, const std::vector<Tensor>& saved, const Tensor& image_gradient,
+                              const OptionalTensor& alpha_gradient, const OptionalTensor& median_gradient,
+                              std::vector<double>& seconds);
+std::vector<Tensor> project_backward_on_cuda(const Inputs& in, const DrawCall& call, const Tensor& drawn,
+                                             const Tensor& row_memory, std::array<bool, kWantedCount> wanted,
+                                             std::vector<double>& seconds);
 
 }  // namespace sw::cuda
