@@ -43,7 +43,7 @@ def photometric_loss(
     """
     _check(image, target, padding)
     total, l1, similarity = photometric(image.clamp(0.0, 1.0) if clamp else image, target, lambda_dssim, padding)
-    return LossPack(total, {"l1": l1.detach(), "ssim": similarity.detach()})
+    return LossPack(total, {"l1": l1, "ssim": similarity})
 
 
 def _check(x: Tensor, y: Tensor, padding: str) -> None:

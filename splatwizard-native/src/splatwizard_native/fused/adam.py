@@ -31,7 +31,6 @@ class AdamUpdate:
     step: int
 
 
-@torch.no_grad()
 def adam_steps(updates: Sequence[AdamUpdate]) -> None:
     """Update `param`, `exp_avg` and `exp_avg_sq` of each in place, densely; as torch.optim.Adam, to 1e-6.
 
@@ -57,20 +56,19 @@ def _by_kernel(updates: Sequence[AdamUpdate]) -> list[AdamUpdate]:
         [u.lr for u in updates], [u.beta1 for u in updates], [u.beta2 for u in updates],
         [u.eps for u in updates], [u.step for u in updates],
     )  # fmt: skip
-    for u in updates:
-        torch.autograd.graph.increment_version(u.param)  # the kernels write behind autograd's back
     return [updates[i] for i in left]
 
 
 def _check(u: AdamUpdate) -> None:
-    for name in ("grad", "exp_avg", "exp_avg_sq"):
-        shape = getattr(u, name).shape
-        if shape != u.param.shape:
-            raise ValueError(f"{name} is {list(shape)}, the parameter {list(u.param.shape)}")
+    shape = u.param.shape
+    if u.grad.shape != shape or u.exp_avg.shape != shape or u.exp_avg_sq.shape != shape:
+        name = next(name for name in ("grad", "exp_avg", "exp_avg_sq") if getattr(u, name).shape != shape)
+        raise ValueError(f"{name} is {list(getattr(u, name).shape)}, the parameter {list(shape)}")
     if u.step < 1:
         raise ValueError(f"Adam's step counts from 1, got {u.step}")
 
 
+@torch.no_grad()
 def _by_torch(u: AdamUpdate) -> None:
     param, exp_avg, exp_avg_sq = u.param, u.exp_avg, u.exp_avg_sq
     grad = u.grad.contiguous()

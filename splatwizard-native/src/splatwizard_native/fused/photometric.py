@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Literal
 
 import torch
@@ -22,7 +23,7 @@ C2 = 0.03**2
 def photometric(
     image: Tensor, target: Tensor, lambda_dssim: float, padding: Padding = "same"
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return (1 - lambda) L1 + lambda (1 - SSIM), differentiable in `image`, and beside it L1 and SSIM, scalars.
+    """Return (1 - lambda) L1 + lambda (1 - SSIM), differentiable in `image`, and beside it L1 and SSIM, detached.
 
     In float32 fused kernels compute all three; if `target` needs a gradient the torch path is taken.
 
@@ -30,14 +31,12 @@ def photometric(
     padding         of SSIM: "same", zeros beside the image; "valid": only where the window fits
     Source: Wang et al. 2004: window 11 x 11, Gaussian with sigma 1.5, per channel; moments as E[ab] - E[a]E[b].
     """
-    node = _fused(image, target)
-    if node is not None:
-        return node.apply(  # type: ignore[no-untyped-call,no-any-return]
-            image, target, padding == "valid", 1.0 - lambda_dssim, -lambda_dssim, lambda_dssim
-        )
+    fused = _fused(image, target)
+    if fused is not None:
+        return fused(image, target, padding == "valid", 1.0 - lambda_dssim, -lambda_dssim, lambda_dssim)
     l1 = (image - target).abs().mean()
     similarity = _ssim_torch(image, target, padding)
-    return (1.0 - lambda_dssim) * l1 + lambda_dssim * (1.0 - similarity), l1, similarity
+    return (1.0 - lambda_dssim) * l1 + lambda_dssim * (1.0 - similarity), l1.detach(), similarity.detach()
 
 
 class _Photometric(torch.autograd.Function):
@@ -65,33 +64,6 @@ class _Photometric(torch.autograd.Function):
         return scaled, None, None, None, None, None
 
 
-class _PhotometricOnCuda(torch.autograd.Function):
-    """The same on a GPU, where no number is waited for: the gradient is put together when its scale is known."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, x: Tensor, y: Tensor, valid: bool, l1_weight: float, ssim_weight: float, offset: float
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        images = [t.detach().reshape(-1, *t.shape[-2:]).contiguous() for t in (x, y)]
-        ctx.settings = valid, l1_weight, ssim_weight
-        means, slopes = torch.ops.splatwizard_training.photometric_means(
-            *images, *ctx.settings, offset, ctx.needs_input_grad[0]
-        )
-        ctx.save_for_backward(*images, slopes)
-        ctx.shape = x.shape
-        total, l1, similarity = means.unbind()
-        ctx.mark_non_differentiable(l1, similarity)
-        return total, l1, similarity
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad_output: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
-        grad = torch.ops.splatwizard_training.photometric_backward(
-            *ctx.saved_tensors, grad_output.contiguous(), *ctx.settings
-        )
-        return grad.view(ctx.shape), None, None, None, None, None
-
-
 def _ssim_torch(x: Tensor, y: Tensor, padding: Padding) -> Tensor:
     height, width = x.shape[-2:]
     moments = torch.stack([x, y, x * x, y * y, x * y]).reshape(1, -1, height, width)  # [1, 5C, H, W]
@@ -110,10 +82,11 @@ def _ssim_torch(x: Tensor, y: Tensor, padding: Padding) -> Tensor:
     return similarity
 
 
-def _fused(x: Tensor, y: Tensor) -> type[torch.autograd.Function] | None:
+def _fused(x: Tensor, y: Tensor) -> Callable[..., tuple[Tensor, Tensor, Tensor]] | None:
     """Return the fused loss that takes these images; None: torch operations do."""
     if x.dtype != torch.float32 or y.requires_grad:
         return None
     if x.is_cuda:
-        return _PhotometricOnCuda if TRAINING.has_cuda() else None
-    return _Photometric if x.device.type == "cpu" and TRAINING.try_load() else None
+        # A node in C++, where no number is waited for: one in Python took the host as long as the kernels the device.
+        return torch.ops.splatwizard_training.photometric_loss if TRAINING.has_cuda() else None
+    return _Photometric.apply if x.device.type == "cpu" and TRAINING.try_load() else None

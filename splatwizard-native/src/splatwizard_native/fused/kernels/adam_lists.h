@@ -35,4 +35,10 @@ inline bool fits_adam(at::Device device, size_t alignment, int64_t step,
   return step >= 1;
 }
 
+// Count up the versions, as every change in place does: the kernels write behind autograd's back.
+inline void count_versions(const std::vector<at::Tensor>& params) {
+  for (const at::Tensor& param : params)
+    if (!param.is_inference()) param.unsafeGetTensorImpl()->bump_version();
+}
+
 }  // namespace splatwizard

@@ -70,6 +70,7 @@ std::vector<int64_t> adam_many(const std::vector<at::Tensor>& params, const std:
         static_cast<float>(1. / std::sqrt(1. - std::pow(beta2, t))), static_cast<float>(epss[i])};
     SW_SELECT(adam)(args, splatwizard::torch_parallel());
   }
+  splatwizard::count_versions(params);
   return left;
 }
 
@@ -78,11 +79,9 @@ std::vector<int64_t> adam_many(const std::vector<at::Tensor>& params, const std:
 TORCH_LIBRARY(splatwizard_training, m) {
   m.def("photometric(Tensor x, Tensor y, bool valid, float l1_weight, float ssim_weight, bool with_grad)"
         " -> (float, float, Tensor)");
-  // On CUDA, where nothing may wait for a number: means [3] = offset + weighted sum, L1, SSIM; see binding_cuda.cpp.
-  m.def("photometric_means(Tensor x, Tensor y, bool valid, float l1_weight, float ssim_weight, float offset,"
-        " bool with_grad) -> (Tensor means, Tensor slopes)");
-  m.def("photometric_backward(Tensor x, Tensor y, Tensor slopes, Tensor scale, bool valid, float l1_weight,"
-        " float ssim_weight) -> Tensor");
+  // On CUDA, differentiable: offset + weighted sum, L1, SSIM, none of which the host waits for; see binding_cuda.cpp.
+  m.def("photometric_loss(Tensor x, Tensor y, bool valid, float l1_weight, float ssim_weight, float offset)"
+        " -> (Tensor total, Tensor l1, Tensor similarity)");
   m.def("adam_many(Tensor(a!)[] params, Tensor[] grads, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs, float[] lrs,"
         " float[] beta1s, float[] beta2s, float[] epss, int[] steps) -> int[]");
   m.impl("photometric", c10::DispatchKey::CPU, TORCH_FN(photometric));

@@ -1,12 +1,14 @@
 // The training kernels on CUDA as torch ops, on the current stream. Compiled only where there is CUDA.
 #ifdef SW_WITH_CUDA
 
+#include <ATen/core/LegacyTypeDispatch.h>
 #include <ATen/core/Tensor.h>
 #include <ATen/ops/empty.h>
 #include <ATen/ops/empty_like.h>
 #include <c10/cuda/CUDAException.h>
 #include <c10/cuda/CUDAGuard.h>
 #include <c10/cuda/CUDAStream.h>
+#include <torch/csrc/autograd/custom_function.h>
 #include <torch/library.h>
 
 #include <algorithm>
@@ -43,18 +45,22 @@ kernels::Photometric photometric_args(const at::Tensor& x, const at::Tensor& y, 
           valid, l1_weight, ssim_weight, 0., nullptr};
 }
 
-// [3]: offset + l1_weight L1 + ssim_weight SSIM, and both means; and what the backward pass needs (empty unless
-// with_grad).
-std::tuple<at::Tensor, at::Tensor> photometric(const at::Tensor& x, const at::Tensor& y, bool valid, double l1_weight,
-                                               double ssim_weight, double offset, bool with_grad) {
-  kernels::Photometric args = photometric_args(x, y, valid, l1_weight, ssim_weight);
+struct Weights {
+  bool valid;
+  double l1, ssim, offset;
+};
+
+// [3]: offset + weighted sum, L1, SSIM; and what the backward pass needs (empty unless with_grad).
+std::tuple<at::Tensor, at::Tensor> photometric_means(const at::Tensor& x, const at::Tensor& y, const Weights& weights,
+                                                     bool with_grad) {
+  kernels::Photometric args = photometric_args(x, y, weights.valid, weights.l1, weights.ssim);
   const c10::cuda::CUDAGuard guard(x.device());
   const cudaStream_t stream = c10::cuda::getCurrentCUDAStream();
   const auto real = x.options().requires_grad(false);
   const at::Tensor means = at::empty({3}, real);
   const at::Tensor sums = at::empty({2 + 2 * kernels::photometric_blocks(args)}, real);  // the counter, and each block's
   at::Tensor slopes = at::empty({with_grad ? 3 * x.numel() : 0}, real);
-  args.offset = offset;
+  args.offset = weights.offset;
   args.slopes = with_grad ? slopes.mutable_data_ptr<float>() : nullptr;
   C10_CUDA_CHECK(cudaMemsetAsync(sums.data_ptr(), 0, sizeof(float2), stream));
   auto* const places = static_cast<float2*>(sums.data_ptr());
@@ -64,11 +70,9 @@ std::tuple<at::Tensor, at::Tensor> photometric(const at::Tensor& x, const at::Te
 }
 
 at::Tensor photometric_backward(const at::Tensor& x, const at::Tensor& y, const at::Tensor& slopes,
-                                const at::Tensor& scale, bool valid, double l1_weight, double ssim_weight) {
-  kernels::Photometric args = photometric_args(x, y, valid, l1_weight, ssim_weight);
-  check(slopes, "photometric_backward", "slopes");
-  check(scale, "photometric_backward", "scale");
-  TORCH_CHECK(slopes.numel() == 3 * x.numel() && scale.numel() == 1, "photometric_backward: slopes or scale do not fit");
+                                const at::Tensor& scale, const Weights& weights) {
+  kernels::Photometric args = photometric_args(x, y, weights.valid, weights.l1, weights.ssim);
+  check(scale, "photometric_loss", "the gradient of the loss");
   const c10::cuda::CUDAGuard guard(x.device());
   args.slopes = slopes.mutable_data_ptr<float>();
   at::Tensor grad = at::empty_like(x);
@@ -76,6 +80,47 @@ at::Tensor photometric_backward(const at::Tensor& x, const at::Tensor& y, const 
                                 c10::cuda::getCurrentCUDAStream());
   C10_CUDA_KERNEL_LAUNCH_CHECK();
   return grad;
+}
+
+// The loss as a node of autograd: its gradient is put together when its scale is known.
+struct PhotometricLoss : torch::autograd::Function<PhotometricLoss> {
+  static torch::autograd::variable_list forward(torch::autograd::AutogradContext* ctx, const at::Tensor& x,
+                                                const at::Tensor& y, const Weights& weights, bool with_grad) {
+    const at::AutoDispatchBelowADInplaceOrView plain;
+    TORCH_CHECK(x.dim() >= 2, "photometric_loss: x must be [...,H,W], got ", x.sizes());
+    const auto planes = [](const at::Tensor& t) {
+      const at::Tensor whole = t.contiguous();
+      return t.dim() == 3 ? whole : whole.view({-1, t.size(-2), t.size(-1)});
+    };
+    const at::Tensor image = planes(x), target = planes(y);
+    auto [means, slopes] = photometric_means(image, target, weights, with_grad);
+    const at::Tensor total = means.select(0, 0), l1 = means.select(0, 1), similarity = means.select(0, 2);
+    ctx->mark_non_differentiable({l1, similarity});
+    ctx->set_materialize_grads(false);
+    ctx->save_for_backward({image, target, slopes});
+    ctx->saved_data["weights"] = std::vector<double>{double(weights.valid), weights.l1, weights.ssim};
+    ctx->saved_data["shape"] = x.sizes();
+    return {total, l1, similarity};
+  }
+
+  static torch::autograd::variable_list backward(torch::autograd::AutogradContext* ctx,
+                                                 const torch::autograd::variable_list& grads) {
+    TORCH_CHECK(!at::GradMode::is_enabled(), "photometric_loss: its gradient cannot be differentiated again");
+    const at::AutoDispatchBelowADInplaceOrView plain;
+    const auto saved = ctx->get_saved_variables();
+    const auto weights = ctx->saved_data["weights"].toDoubleVector();
+    const at::Tensor grad = photometric_backward(saved[0], saved[1], saved[2], grads[0].contiguous(),
+                                                 {weights[0] != 0, weights[1], weights[2], 0.});
+    const auto shape = ctx->saved_data["shape"].toIntVector();
+    return {shape.size() == 3 ? grad : grad.view(shape), at::Tensor(), at::Tensor(), at::Tensor()};
+  }
+};
+
+std::tuple<at::Tensor, at::Tensor, at::Tensor> photometric_loss(const at::Tensor& x, const at::Tensor& y, bool valid,
+                                                                double l1_weight, double ssim_weight, double offset) {
+  const bool with_grad = at::GradMode::is_enabled() && x.requires_grad();
+  const auto out = PhotometricLoss::apply(x, y, Weights{valid, l1_weight, ssim_weight, offset}, with_grad);
+  return {out[0], out[1], out[2]};
 }
 
 // One step of many tensors, in one launch. Returns the places of those that the kernel cannot take: they are left as
@@ -110,15 +155,16 @@ std::vector<int64_t> adam_many(const std::vector<at::Tensor>& params, const std:
     kernels::adam(tensors.data() + first, int(std::min<size_t>(kernels::kAdamTensors, tensors.size() - first)),
                   c10::cuda::getCurrentCUDAStream());
   C10_CUDA_KERNEL_LAUNCH_CHECK();
+  splatwizard::count_versions(params);
   return left;
 }
 
 }  // namespace
 
 TORCH_LIBRARY_IMPL(splatwizard_training, CUDA, m) {
-  m.impl("photometric_means", photometric);
-  m.impl("photometric_backward", photometric_backward);
   m.impl("adam_many", adam_many);
 }
+
+TORCH_LIBRARY_IMPL(splatwizard_training, CompositeImplicitAutograd, m) { m.impl("photometric_loss", photometric_loss); }
 
 #endif  // SW_WITH_CUDA
