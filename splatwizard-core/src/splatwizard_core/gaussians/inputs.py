@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor
 
 from splatwizard_core.errors import ShapeError
+
+Layout: TypeAlias = "tuple[tuple[str, torch.Size, torch.dtype, torch.device], ...]"
+"""Name, shape, dtype and device of every tensor that is there, means first: all that checks look at."""
 
 SH_C0 = 0.28209479177387814
 """Value of the basis function of degree 0."""
@@ -55,27 +59,9 @@ class SH:
             return rest
         return self.dc if rest is None else torch.cat([self.dc, rest], dim=1)
 
-    def validate(self) -> None:
-        """Raise ShapeError unless exactly one storage form is there, with the coefficients of the active degree.
 
-        With two forms it would be open which one is drawn.
-        """
-        stored = {k for k in ("dense", "dc", "rest", "codebook", "indices") if getattr(self, k) is not None}
-        forms = ({"dense"}, {"dc"}, {"dc", "rest"}, {"codebook", "indices"}, {"dc", "codebook", "indices"})
-        if stored not in forms:
-            raise ShapeError(
-                f"SH holds {', '.join(sorted(stored)) or 'nothing'}; it must be dense, or dc (and rest), "
-                "or codebook and indices (and dc)"
-            )
-        held = sum(t.shape[1] for t in (self.dense, self.dc, self.rest, self.codebook) if t is not None)
-        needed = (self.active_degree + 1) ** 2
-        if held < needed:
-            raise ShapeError(f"SH degree {self.active_degree} needs {needed} coefficients, here are {held}")
-
-
-def check_shape(name: str, tensor: Tensor, expected: tuple[int | str, ...]) -> None:
-    """Raise ShapeError unless `tensor` has the sizes `expected`; a string there stands for any size."""
-    shape = tensor.shape
+def check_shape(name: str, shape: torch.Size, expected: tuple[int | str, ...]) -> None:
+    """Raise ShapeError unless the tensor's shape is `expected`; a string there stands for any size."""
     if len(shape) != len(expected) or any(a != e for a, e in zip(shape, expected, strict=True) if isinstance(e, int)):
         wanted = ", ".join(str(e) for e in expected)
         raise ShapeError(f"{name} must be [{wanted}], got {list(shape)}", actual=shape, expected=expected)
@@ -171,30 +157,49 @@ class GaussianInputs:
             return False
         return self.means.requires_grad or any(t.requires_grad for t in self.tensors().values())
 
-    def validate(self) -> None:
-        """Raise ShapeError unless the fields fit together (values are the rasterizer's business)."""
-        rows = "M" if self.geom_indices is not None else len(self)
-        sizes: dict[int | str, int | str] = {"N": len(self), "rows": rows}
-        for name, tensor in self.tensors().items():
-            check_shape(f"GaussianInputs.{name}", tensor, tuple(sizes.get(size, size) for size in _SIZES[name]))
-            if tensor.device != self.means.device:
-                raise ShapeError(
-                    f"GaussianInputs mixes devices: {name} is on {tensor.device}, means on {self.means.device}"
-                )
-        shaped = (self.scales, self.quats, self.geom_indices, self.scale_factors)
-        if self.cov3d is not None:
-            if any(t is not None for t in shaped):
-                raise ShapeError("GaussianInputs.cov3d excludes scales, quats, geom_indices and scale_factors")
-        elif self.scales is None or self.quats is None:
-            raise ShapeError("GaussianInputs needs either scales and quats, or cov3d")
-        elif self.scales.shape[1] not in (2, 3) or len(self.scales) != len(self.quats):
-            raise ShapeError(
-                f"GaussianInputs.scales must be [{rows}, 3], or [{rows}, 2] for surfels, and as long as quats; "
-                f"got {list(self.scales.shape)} and {list(self.quats.shape)}",
-                actual=self.scales.shape,
-                expected=(rows, "2 or 3"),
-            )
-        if (self.sh is None) == (self.colors is None):
-            raise ShapeError("GaussianInputs needs either sh or colors")
-        if self.sh is not None:
-            self.sh.validate()
+    def validate(self) -> Layout:
+        """Return the layout, or raise ShapeError if the fields do not fit together (values are no matter of shape)."""
+        layout = tuple([(name, t.shape, t.dtype, t.device) for name, t in self.tensors().items()])
+        _check_layout(layout, None if self.sh is None else self.sh.active_degree)
+        return layout
+
+
+@functools.lru_cache(maxsize=64)  # a training asks for the same at every step
+def _check_layout(layout: Layout, sh_degree: int | None) -> None:
+    shapes = {name: shape for name, shape, _, _ in layout}
+    n, device = shapes["means"][0], layout[0][3]
+    rows = "M" if "geom_indices" in shapes else n
+    sizes: dict[int | str, int | str] = {"N": n, "rows": rows}
+    for name, shape, _, there in layout:
+        check_shape(f"GaussianInputs.{name}", shape, tuple(sizes.get(size, size) for size in _SIZES[name]))
+        if there != device:
+            raise ShapeError(f"GaussianInputs mixes devices: {name} is on {there}, means on {device}")
+    if "cov3d" in shapes:
+        if shapes.keys() & {"scales", "quats", "geom_indices", "scale_factors"}:
+            raise ShapeError("GaussianInputs.cov3d excludes scales, quats, geom_indices and scale_factors")
+    elif not {"scales", "quats"} <= shapes.keys():
+        raise ShapeError("GaussianInputs needs either scales and quats, or cov3d")
+    elif (scales := shapes["scales"])[1] not in (2, 3) or scales[0] != shapes["quats"][0]:
+        raise ShapeError(
+            f"GaussianInputs.scales must be [{rows}, 3], or [{rows}, 2] for surfels, and as long as quats; "
+            f"got {list(scales)} and {list(shapes['quats'])}",
+            actual=scales,
+            expected=(rows, "2 or 3"),
+        )
+    if (sh_degree is None) == ("colors" not in shapes):
+        raise ShapeError("GaussianInputs needs either sh or colors")
+    if sh_degree is not None:
+        _check_sh({name[3:]: shape for name, shape in shapes.items() if name.startswith("sh.")}, sh_degree)
+
+
+def _check_sh(shapes: dict[str, torch.Size], degree: int) -> None:
+    """With two storage forms it would be open which one is drawn."""
+    forms = ({"dense"}, {"dc"}, {"dc", "rest"}, {"codebook", "indices"}, {"dc", "codebook", "indices"})
+    if set(shapes) not in forms:
+        raise ShapeError(
+            f"SH holds {', '.join(sorted(shapes)) or 'nothing'}; it must be dense, or dc (and rest), "
+            "or codebook and indices (and dc)"
+        )
+    held, needed = sum(shape[1] for name, shape in shapes.items() if name != "indices"), (degree + 1) ** 2
+    if held < needed:
+        raise ShapeError(f"SH degree {degree} needs {needed} coefficients, here are {held}")

@@ -74,7 +74,7 @@ class GaussianModel(SplatModel):
             "quats": (quats, (4,)),
         }
         for name, (tensor, tail) in tails.items():
-            check_shape(f"GaussianModel.{name}", tensor, (n, *tail))
+            check_shape(f"GaussianModel.{name}", tensor.shape, (n, *tail))
             self.register_parameter(name, nn.Parameter(tensor.detach()))
         degree = self.max_sh_degree
         if (degree + 1) ** 2 != sh_rest.shape[1] + 1 or degree > 3:

@@ -17,7 +17,7 @@ from splatwizard_core.plugins.registry import Entry, Registry
 from splatwizard_core.rendering.features import Feature
 
 if TYPE_CHECKING:
-    from splatwizard_core.gaussians.inputs import GaussianInputs
+    from splatwizard_core.gaussians.inputs import GaussianInputs, Layout
     from splatwizard_core.rendering.rasterizer import RasterOptions
 
 
@@ -118,7 +118,7 @@ class RasterizerInfo:
         Raises ShapeError for inputs that do not fit together, CapabilityError for a feature or a device, ConfigError
         for a profile or another option.
         """
-        g.validate()
+        layout = g.validate()
         self.on(g.means.device.type).check_offered(Feature.asked_by(opt, g))
         if opt.profile and opt.profile not in self.profiles:
             raise ConfigError(
@@ -128,13 +128,13 @@ class RasterizerInfo:
             )
         if opt.clamp_grad not in ("exact", "pass"):
             raise ConfigError(f"clamp_grad is '{opt.clamp_grad}', must be 'exact' or 'pass'")
-        self._check_placement(g)
+        self._check_placement(layout)
 
     def check_geometry(self, g: GaussianInputs) -> None:
         """Hold a request for `visible_filter` against the declaration: as `check_request`, of shapes alone."""
-        g.validate()
+        layout = g.validate()
         self.on(g.means.device.type).check_offered(Feature.VISIBLE_FILTER | Feature.geometry_of(g))
-        self._check_placement(g)
+        self._check_placement(layout)
 
     def check_offered(self, asked: Feature) -> None:
         """Raise CapabilityError unless everything in `asked` is declared, together and with what `needs` names."""
@@ -158,21 +158,20 @@ class RasterizerInfo:
                     f"rasterizer '{self.name}' does not offer {' and '.join(sorted(combo))} together", missing=combo
                 )
 
-    def _check_placement(self, g: GaussianInputs) -> None:
+    def _check_placement(self, layout: Layout) -> None:
         """All tensors share a kind of device and a dtype that are declared (GaussianInputs.validate: one device)."""
-        if g.means.device.type not in self.devices:
+        _, _, first, device = layout[0]  # of means
+        if device.type not in self.devices:
             raise CapabilityError(
-                f"rasterizer '{self.name}' draws on {', '.join(sorted(self.devices))}, "
-                f"the Gaussians are on {g.means.device}",
+                f"rasterizer '{self.name}' draws on {', '.join(sorted(self.devices))}, the Gaussians are on {device}",
                 missing=(),
             )
-        dtype = g.means.dtype
-        for name, tensor in g.tensors().items():
-            if tensor.is_floating_point() and (tensor.dtype != dtype or _dtype_name(dtype) not in self.dtypes):
+        declared = _dtype_name(first) in self.dtypes
+        for name, _, dtype, _ in layout:
+            if dtype.is_floating_point and not (declared and dtype == first):
                 raise ShapeError(
                     f"rasterizer '{self.name}' needs all tensors in one dtype of {', '.join(sorted(self.dtypes))}: "
-                    f"{name} is {_dtype_name(tensor.dtype)}"
-                    + (f", means {_dtype_name(dtype)}" if name != "means" else "")
+                    f"{name} is {_dtype_name(dtype)}" + (f", means {_dtype_name(first)}" if name != "means" else "")
                 )
 
 
