@@ -12,7 +12,6 @@ GRADIENT_STATISTICS = ("grad_accum", "denom")
 """Buffers of a GaussianModel: sum of the gradients' lengths, and over how many views."""
 
 
-@torch.no_grad()
 def accumulate_statistics(model: GaussianModel, gradients: Tensor, radii: Tensor) -> None:
     """Add one view to `grad_accum`, `denom` and `max_radii2d`, in place; Gaussians with radius 0 are left alone.
 

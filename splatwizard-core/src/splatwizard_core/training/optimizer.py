@@ -81,7 +81,6 @@ class SplatOptimizer:
         """Set the learning rate of a group from the next `step` on."""
         self.groups[name].lr = lr
 
-    @torch.no_grad()
     def step(self, result: RenderResult | None = None) -> None:
         """Update every parameter that has a gradient.
 

@@ -117,6 +117,12 @@ class Trainer:
                 f"stage '{self.stage.name}' ends at step {self.stage.iterations}, and {self.step} steps are done: "
                 "raise `iterations` to train on"
             )
+        # Backward in this thread: torch's own for the GPU would be woken up each time, and take the interpreter's lock.
+        with torch.autograd.set_multithreading_enabled(False):
+            self._run_steps(until, after_step)
+        self.check_losses()
+
+    def _run_steps(self, until: int, after_step: Callable[[StepRecord], None]) -> None:
         while self.step < min(until, self.stage.iterations) and not self.stopped:
             try:
                 record = self._run_step(self.step + 1)
@@ -127,7 +133,6 @@ class Trainer:
                 raise self._out_of_memory(error) from error
             self.step += 1
             after_step(record)
-        self.check_losses()
 
     def _run_step(self, step: int) -> StepRecord:
         context, mark = self.context, self._mark
@@ -159,11 +164,10 @@ class Trainer:
         context.result, context.loss = result, loss
         with torch.no_grad():
             stop = self.post.exec(step, context) or stop
-        self._check_rows(step)
-        mark("post")
-
-        if step < self.stage.iterations:
-            self.optimizer.step(result)
+            self._check_rows(step)
+            mark("post")
+            if step < self.stage.iterations:
+                self.optimizer.step(result)
         self.optimizer.zero_grad()
         mark("optimize")
         if self.stage_clock is not None:
@@ -185,14 +189,10 @@ class Trainer:
         # `backward(one)` would import sympy to compare two shapes, which takes seconds, and `backward()` makes a one of
         # its own at each step: so the engine is called as both would.
         engine: Any = torch.autograd.Variable._execution_engine
-        # In this thread: torch's thread for the GPU would be woken up, and take the interpreter's lock, each time.
-        with torch.autograd.set_multithreading_enabled(False):
-            engine.run_backward(
-                (total,), (self._one,), False, False, (), allow_unreachable=True, accumulate_grad=True
-            )  # fmt: skip
+        engine.run_backward((total,), (self._one,), False, False, (), allow_unreachable=True, accumulate_grad=True)
 
     def _record(self, step: int, view: View, loss: LossPack) -> StepRecord:
-        parts = {name: part.detach() for name, part in loss.parts.items()}
+        parts = {name: part.detach() if part.requires_grad else part for name, part in loss.parts.items()}
         record = StepRecord(
             self.index, self.stage.name, step, self.stage.iterations, view.name, loss.total.detach(), parts
         )
