@@ -9,7 +9,7 @@ from splatwizard_core.api import OptimizationParams, Params, apply_overrides
 from sw_gaussians.fast import rate_factors
 
 FUSED_FROM = 200_000
-"""Gaussians from which updates in the backward pass save time: of 250,000 a step takes as long, of a million 0.91."""
+"""Gaussians from which updates in the backward pass save time: of 185,000 a step takes as long, of a million 0.91."""
 
 
 class LearningRates(Params):

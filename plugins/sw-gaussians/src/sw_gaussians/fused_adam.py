@@ -48,7 +48,7 @@ class FusingOptimizer(SplatOptimizer):
     def step(self, result: RenderResult | None = None) -> None:
         """Update every parameter that has a gradient; what the backward pass has done is counted."""
         for name, param in self._waiting:
-            if not end_offer(param):
+            if not end_offer(param) and param.grad is None:  # with a gradient it is done, and counted, below
                 self.states[name].step += 1
         self._waiting = ()
         super().step(result)

@@ -168,7 +168,9 @@ def _draw_on_cuda(call: Call, tensors: dict[str, Tensor | None]) -> tuple[Tensor
 
 
 def backward_seconds() -> dict[str, float]:
-    """Seconds of each stage of the last backward pass of a counting rasterizer on CUDA."""
+    """Seconds of each stage of the last backward pass of a counting rasterizer on CUDA; none without CUDA."""
+    if not MODULE.has_cuda():
+        return {}
     return dict(zip(BACKWARD_STAGES, torch.ops.sw_rasterizers.backward_seconds(), strict=False))
 
 

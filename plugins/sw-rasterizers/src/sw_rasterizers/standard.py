@@ -36,8 +36,8 @@ class StandardRasterizer:
     Profile "dgr-exact" also cuts each splat at the original's square of 16x16 tiles (3 sigma) and takes over the
     original's gradients through the clamps of alpha and of the Jacobian.
 
-    count   also count evaluated and blended pixel-splat pairs into the statistics, and on CUDA measure the stages;
-            slow, for benchmarks
+    count   also count evaluated and blended pixel-splat pairs into the statistics, and on CUDA measure the stages
+            (those of the backward pass are in `ops.backward_seconds()`); slow, for benchmarks
     """
 
     info: RasterizerInfo = RasterizerInfo.declared(plugin.register_rasterizers, "standard")

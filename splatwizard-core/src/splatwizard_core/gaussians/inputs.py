@@ -193,7 +193,7 @@ def _check_layout(layout: Layout, sh_degree: int | None) -> None:
 
 
 def _check_sh(shapes: dict[str, torch.Size], degree: int) -> None:
-    """With two storage forms it would be open which one is drawn."""
+    """Raise ShapeError unless exactly one storage form is there: of two it would be open which one is drawn."""
     forms = ({"dense"}, {"dc"}, {"dc", "rest"}, {"codebook", "indices"}, {"dc", "codebook", "indices"})
     if set(shapes) not in forms:
         raise ShapeError(

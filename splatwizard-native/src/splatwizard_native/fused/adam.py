@@ -37,15 +37,14 @@ def adam_steps(updates: Sequence[AdamUpdate]) -> None:
     All in one call of the kernels, on CUDA in one launch. Raises ValueError before any is done if shapes differ.
     Source: Kingma & Ba (arXiv 1412.6980), bias correction as torch applies it.
     """
-    left = list(updates)
-    for u in left:
+    by_kind: dict[str, list[AdamUpdate]] = {}
+    for u in updates:
         _check(u)
-    for kind in ("cuda", "cpu"):
-        together = [u for u in left if u.param.device.type == kind]
-        if together and (TRAINING.has_cuda() if kind == "cuda" else TRAINING.try_load()):
-            left = [u for u in left if u.param.device.type != kind] + _by_kernel(together)
-    for u in left:
-        _by_torch(u)
+        by_kind.setdefault(u.param.device.type, []).append(u)
+    for kind, together in by_kind.items():
+        kernels = TRAINING.has_cuda() if kind == "cuda" else kind == "cpu" and TRAINING.try_load()
+        for u in _by_kernel(together) if kernels else together:
+            _by_torch(u)
 
 
 def _by_kernel(updates: Sequence[AdamUpdate]) -> list[AdamUpdate]:

@@ -26,8 +26,8 @@ def offer_update(param: Tensor, update: AdamUpdate) -> None:
 
 def offered_update(param: Tensor) -> AdamUpdate | None:
     """The update that waits at a parameter; None: none does."""
-    update, version = getattr(param, "update_in_backward", None) or (None, 0)
-    return update if version == param._version else None
+    offer: tuple[AdamUpdate, int] | None = getattr(param, "update_in_backward", None)
+    return offer[0] if offer is not None and offer[1] == param._version else None
 
 
 def end_offer(param: Tensor) -> bool:

@@ -26,7 +26,8 @@ Image image_of(const Inputs& in) {
 
 }  // namespace
 
-sw::cuda::Rendered sw::cuda::render_on_cuda(const Inputs& in, at::ArrayRef<double> camera, int64_t width, int64_t height) {
+sw::cuda::Rendered sw::cuda::render_on_cuda(const Inputs& in, at::ArrayRef<double> camera, int64_t width,
+                                            int64_t height) {
   const c10::cuda::CUDAGuard guard(in.means.device());
   const cudaStream_t stream = c10::cuda::getCurrentCUDAStream();
   const auto view = View<float>::from(camera.data(), int(width), int(height));
@@ -135,8 +136,8 @@ Rendered render(const Tensor& means, const Tensor& opacities, const OptionalTens
 
 }  // namespace
 
-// Gradients in two nodes, so that what the first one needs, the image's gradient and the lists, is free again before the
-// second one allocates the gradients of the inputs, which are larger than all else.
+// Gradients in two nodes, so that what the first one needs, the image's gradient and the lists, is free again before
+// the second one allocates the gradients of the inputs, which are larger than all else.
 //
 // Returns rows [N, row_length], sums of every Gaussian, zeros where it was not drawn.
 Tensor sw::cuda::blend_backward_on_cuda(const DrawCall& call, const std::vector<Tensor>& saved,
@@ -150,8 +151,8 @@ Tensor sw::cuda::blend_backward_on_cuda(const DrawCall& call, const std::vector<
                 "sw_rasterizers: gradients must be contiguous and on one device");
   TORCH_CHECK(image_gradient.is_contiguous() && image_gradient.scalar_type() == at::kFloat &&
                   image_gradient.sizes() == at::IntArrayRef({channels.total(), height, width}),
-              "sw_rasterizers: the image's gradient must be contiguous float32 of shape [", channels.total(), ", ", height,
-              ", ", width, "], got ", image_gradient.sizes());
+              "sw_rasterizers: the image's gradient must be contiguous float32 of shape [", channels.total(), ", ",
+              height, ", ", width, "], got ", image_gradient.sizes());
   const c10::cuda::CUDAGuard guard(image_gradient.device());
   const cudaStream_t stream = c10::cuda::getCurrentCUDAStream();
   const auto view = View<float>::from(call.camera.data(), int(width), int(height));
@@ -220,8 +221,9 @@ std::vector<Tensor> sw::cuda::project_backward_on_cuda(const Inputs& in, const D
   clock.mark();
 
   const std::vector<Tensor>& updated = call.updated;
-  for (const int i : {0, 1})
-    if (!updated.empty() && updated[3 * i].numel() > 0) wanted[i == 0 ? kWantShDc : kWantShRest] = false;
+  const auto updates = [&](size_t first) { return updated[first].defined() && updated[first].numel() > 0; };
+  for (size_t i = 0; i < updated.size(); i += 3)
+    if (updates(i)) wanted[i == 0 ? kWantShDc : kWantShRest] = false;
   std::vector<Tensor> grads(kWantedCount);
   const bool shared = in.geom_indices.has_value();  // then the rows of shapes are summed up, starting at 0
   const auto want = [&](int which, const OptionalTensor& like) {
@@ -256,7 +258,7 @@ std::vector<Tensor> sw::cuda::project_backward_on_cuda(const Inputs& in, const D
   ShAdam adam{};
   for (size_t i = 0; i < updated.size(); i += 3) {
     const OptionalTensor& like = i == 0 ? in.sh_dc : in.sh_rest;
-    if (updated[i].numel() == 0) continue;
+    if (!updates(i)) continue;
     TORCH_CHECK(like.has_value() && updated[i].data_ptr() == like->data_ptr(),
                 "sw_rasterizers: Adam in the backward pass is of the tensors that were drawn");
     for (size_t k = i; k < i + 3; ++k)

@@ -67,6 +67,8 @@ inline void check_placement(const Inputs& in) {
               in.means.scalar_type());
   TORCH_CHECK(!in.background.has_value() || in.background->device() == in.means.device(),
               "sw_rasterizers: background is on ", in.background->device(), ", means on ", in.means.device());
+  TORCH_CHECK(!in.background.has_value() || in.background->is_contiguous(),
+              "sw_rasterizers: background must be contiguous");
   TORCH_CHECK(!in.quats.has_value() || reinterpret_cast<uintptr_t>(in.quats->data_ptr()) % 16 == 0,
               "sw_rasterizers: on CUDA quats must start at a multiple of 16 bytes; clone() it");
 }
@@ -310,9 +312,9 @@ struct DrawCall : torch::CustomClassHolder {
   OptionalTensor geom_indices, visible, background;
   int64_t gaussians = 0;
   Channels channels{};
-  Tensor grad2d, absgrad2d;      // [0] until the backward pass makes them [N,2]; undefined: not wanted
-  std::vector<Tensor> updated;   // parameter and moments of sh_dc, of sh_rest (empty tensors: not this one), or nothing
-  std::vector<double> rates;     // six numbers for each
+  Tensor grad2d, absgrad2d;     // [0] until the backward pass makes them [N,2]; undefined: not wanted
+  std::vector<Tensor> updated;  // nothing, or parameter and moments of sh_dc, of sh_rest; an empty one: not it
+  std::vector<double> rates;    // six numbers for each
 };
 
 Tensor blend_backward_on_cuda(const DrawCall& call, const std::vector<Tensor>& saved, const Tensor& image_gradient,

@@ -13,6 +13,7 @@
 #include <array>
 #include <mutex>
 #include <tuple>
+#include <utility>
 #include <vector>
 
 #include "binding_cuda.h"
@@ -55,7 +56,8 @@ void keep(AutogradContext* ctx, const DrawingPtr& call) {
   ctx->set_materialize_grads(false);
 }
 DrawingPtr kept(AutogradContext* ctx) {
-  TORCH_CHECK(!at::GradMode::is_enabled(), "sw_rasterizers: gradients of a drawing cannot be differentiated again");
+  TORCH_CHECK(!at::GradMode::is_enabled(),
+              "sw_rasterizers: gradients of a drawing cannot be differentiated again on CUDA (create_graph=True)");
   return c10::static_intrusive_pointer_cast<Drawing>(ctx->saved_data["call"].toCapsule());
 }
 
@@ -66,11 +68,12 @@ std::vector<double> blend_seconds, project_seconds;
 void report(const DrawCall& call, std::vector<double>& to, std::vector<double>&& seconds) {
   if (!(call.flags & kCount)) return;
   const std::lock_guard hold(seconds_lock);
+  if (&to == &blend_seconds) project_seconds.clear();  // of another pass
   to = std::move(seconds);
 }
 
 // First node: a stand-in [N, sums of a Gaussian] without memory, whose gradient is what Blend sums up over the pixels.
-// All state goes through save_for_backward, so that it is freed with the graph even if the result lives on.
+// All large state goes through save_for_backward, so that it is freed with the graph even if the result lives on.
 struct Project : Function<Project> {
   // `inputs`: those that are present, then maybe one that only makes the backward pass happen.
   static Tensor forward(AutogradContext* ctx, const DrawingPtr& call, at::TensorList inputs) {
@@ -103,13 +106,17 @@ struct Project : Function<Project> {
     size_t edge = 0;
     for (size_t i = 0; i < size_t(kInputs); ++i)
       if (call->present[i]) wanted[i] = ctx->needs_input_grad(edge++);
+    // An update whose gradient is not asked for keeps waiting.
+    for (const int i : {0, 1})
+      if (!call->updated.empty() && !wanted[i == 0 ? kWantShDc : kWantShRest]) call->updated[size_t(3 * i)].reset();
     std::vector<double> seconds;
     const Inputs in = call->inputs(given);
     auto found = project_backward_on_cuda(in, *call, stored.back(), rows[0].contiguous(), wanted, seconds);
     report(*call, project_seconds, std::move(seconds));
     // Whoever offered the updates sees by the version that they are done.
     for (size_t i = 0; i < call->updated.size(); i += 3)
-      if (call->updated[i].numel() > 0) call->updated[i].unsafeGetTensorImpl()->bump_version();
+      if (call->updated[i].defined() && call->updated[i].numel() > 0)
+        call->updated[i].unsafeGetTensorImpl()->bump_version();
     call->updated.clear();
     variable_list out(1);
     for (size_t i = 0; i < size_t(kInputs); ++i)
@@ -157,7 +164,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, std::vector<int64_t>, std::vector<dou
   TORCH_CHECK(means.is_cuda(), "sw_rasterizers: draw is for CUDA, means are on ", means.device());
   TORCH_CHECK(camera.size() == 18 && width > 0 && height > 0, "sw_rasterizers: malformed camera");
   TORCH_CHECK(updated.empty() || (updated.size() == 6 && rates.size() == 12),
-              "sw_rasterizers: Adam in the backward pass takes three tensors and six numbers for each of sh_dc, sh_rest");
+              "sw_rasterizers: Adam in the backward pass takes three tensors and six numbers for each of sh_dc, "
+              "sh_rest");
   const auto call = c10::make_intrusive<Drawing>();
   call->camera = camera.vec();
   call->width = width, call->height = height, call->sh_degree = sh_degree;

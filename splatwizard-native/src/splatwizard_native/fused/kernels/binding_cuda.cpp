@@ -29,49 +29,51 @@ void check(const at::Tensor& tensor, const char* op, const char* name) {
               " must be a contiguous float32 tensor on a GPU, got ", tensor.toString());
 }
 
-kernels::Photometric photometric_args(const at::Tensor& x, const at::Tensor& y, bool valid, double l1_weight,
-                                      double ssim_weight) {
-  check(x, "photometric", "x");
-  check(y, "photometric", "y");
-  TORCH_CHECK(x.dim() == 3 && x.sizes() == y.sizes(), "photometric: x and y must be [C,H,W] and alike, got ",
-              x.sizes(), " and ", y.sizes());
-  const int64_t lost = valid ? 10 : 0, most = std::numeric_limits<int>::max();
-  TORCH_CHECK(x.size(0) > 0 && x.size(1) > lost && x.size(2) > lost, "photometric: the image ", x.sizes(),
-              " is too small");
-  // Limits of a launch: planes and rows of tiles.
-  TORCH_CHECK(x.size(0) <= 65535 && x.size(1) <= 65535 * 32 && x.size(2) <= most / 2, "photometric: the image ",
-              x.sizes(), " is too large");
-  return {x.const_data_ptr<float>(), y.const_data_ptr<float>(), int(x.size(0)), int(x.size(1)), int(x.size(2)),
-          valid, l1_weight, ssim_weight, 0., nullptr};
-}
-
 struct Weights {
   bool valid;
   double l1, ssim, offset;
 };
 
+kernels::Photometric photometric_args(const at::Tensor& x, const at::Tensor& y, const Weights& weights) {
+  check(x, "photometric_loss", "x");
+  check(y, "photometric_loss", "y");
+  TORCH_CHECK(x.dim() >= 2 && x.sizes() == y.sizes(), "photometric_loss: x and y must be [...,H,W] and alike, got ",
+              x.sizes(), " and ", y.sizes());
+  const int64_t height = x.size(-2), width = x.size(-1);
+  const int64_t lost = weights.valid ? 10 : 0, most = std::numeric_limits<int>::max();
+  TORCH_CHECK(x.numel() > 0 && height > lost && width > lost, "photometric_loss: the image ", x.sizes(),
+              " is too small");
+  const int64_t planes = x.numel() / (height * width);
+  // Limits of a launch: planes and rows of tiles.
+  TORCH_CHECK(planes <= 65535 && height <= 65535 * 32 && width <= most / 2, "photometric_loss: the image ", x.sizes(),
+              " is too large");
+  return {x.const_data_ptr<float>(), y.const_data_ptr<float>(), int(planes), int(height), int(width),
+          weights.valid, weights.l1, weights.ssim, 0., nullptr};
+}
+
 // [3]: offset + weighted sum, L1, SSIM; and what the backward pass needs (empty unless with_grad).
 std::tuple<at::Tensor, at::Tensor> photometric_means(const at::Tensor& x, const at::Tensor& y, const Weights& weights,
                                                      bool with_grad) {
-  kernels::Photometric args = photometric_args(x, y, weights.valid, weights.l1, weights.ssim);
+  kernels::Photometric args = photometric_args(x, y, weights);
   const c10::cuda::CUDAGuard guard(x.device());
   const cudaStream_t stream = c10::cuda::getCurrentCUDAStream();
   const auto real = x.options().requires_grad(false);
   const at::Tensor means = at::empty({3}, real);
-  const at::Tensor sums = at::empty({2 + 2 * kernels::photometric_blocks(args)}, real);  // the counter, and each block's
+  const at::Tensor sums = at::empty({2 + 2 * kernels::photometric_blocks(args)}, real);  // a counter, and each block's
   at::Tensor slopes = at::empty({with_grad ? 3 * x.numel() : 0}, real);
   args.offset = weights.offset;
   args.slopes = with_grad ? slopes.mutable_data_ptr<float>() : nullptr;
   C10_CUDA_CHECK(cudaMemsetAsync(sums.data_ptr(), 0, sizeof(float2), stream));
   auto* const places = static_cast<float2*>(sums.data_ptr());
-  kernels::photometric(args, {reinterpret_cast<unsigned*>(places), places + 1}, means.mutable_data_ptr<float>(), stream);
+  kernels::photometric(args, {reinterpret_cast<unsigned*>(places), places + 1}, means.mutable_data_ptr<float>(),
+                       stream);
   C10_CUDA_KERNEL_LAUNCH_CHECK();
   return {means, slopes};
 }
 
 at::Tensor photometric_backward(const at::Tensor& x, const at::Tensor& y, const at::Tensor& slopes,
                                 const at::Tensor& scale, const Weights& weights) {
-  kernels::Photometric args = photometric_args(x, y, weights.valid, weights.l1, weights.ssim);
+  kernels::Photometric args = photometric_args(x, y, weights);
   check(scale, "photometric_loss", "the gradient of the loss");
   const c10::cuda::CUDAGuard guard(x.device());
   args.slopes = slopes.mutable_data_ptr<float>();
@@ -87,37 +89,34 @@ struct PhotometricLoss : torch::autograd::Function<PhotometricLoss> {
   static torch::autograd::variable_list forward(torch::autograd::AutogradContext* ctx, const at::Tensor& x,
                                                 const at::Tensor& y, const Weights& weights, bool with_grad) {
     const at::AutoDispatchBelowADInplaceOrView plain;
-    TORCH_CHECK(x.dim() >= 2, "photometric_loss: x must be [...,H,W], got ", x.sizes());
-    const auto planes = [](const at::Tensor& t) {
-      const at::Tensor whole = t.contiguous();
-      return t.dim() == 3 ? whole : whole.view({-1, t.size(-2), t.size(-1)});
-    };
-    const at::Tensor image = planes(x), target = planes(y);
+    const at::Tensor image = x.contiguous(), target = y.contiguous();
     auto [means, slopes] = photometric_means(image, target, weights, with_grad);
     const at::Tensor total = means.select(0, 0), l1 = means.select(0, 1), similarity = means.select(0, 2);
     ctx->mark_non_differentiable({l1, similarity});
     ctx->set_materialize_grads(false);
     ctx->save_for_backward({image, target, slopes});
     ctx->saved_data["weights"] = std::vector<double>{double(weights.valid), weights.l1, weights.ssim};
-    ctx->saved_data["shape"] = x.sizes();
     return {total, l1, similarity};
   }
 
   static torch::autograd::variable_list backward(torch::autograd::AutogradContext* ctx,
                                                  const torch::autograd::variable_list& grads) {
-    TORCH_CHECK(!at::GradMode::is_enabled(), "photometric_loss: its gradient cannot be differentiated again");
+    TORCH_CHECK(!at::GradMode::is_enabled(),
+                "photometric_loss: its gradient cannot be differentiated again on CUDA (create_graph=True)");
     const at::AutoDispatchBelowADInplaceOrView plain;
+    torch::autograd::variable_list out(4);  // of x; none of y, of the weights, of with_grad
+    if (!grads[0].defined()) return out;
     const auto saved = ctx->get_saved_variables();
     const auto weights = ctx->saved_data["weights"].toDoubleVector();
-    const at::Tensor grad = photometric_backward(saved[0], saved[1], saved[2], grads[0].contiguous(),
-                                                 {weights[0] != 0, weights[1], weights[2], 0.});
-    const auto shape = ctx->saved_data["shape"].toIntVector();
-    return {shape.size() == 3 ? grad : grad.view(shape), at::Tensor(), at::Tensor(), at::Tensor()};
+    out[0] = photometric_backward(saved[0], saved[1], saved[2], grads[0].contiguous(),
+                                  {weights[0] != 0, weights[1], weights[2], 0.});
+    return out;
   }
 };
 
 std::tuple<at::Tensor, at::Tensor, at::Tensor> photometric_loss(const at::Tensor& x, const at::Tensor& y, bool valid,
                                                                 double l1_weight, double ssim_weight, double offset) {
+  TORCH_CHECK(!at::GradMode::is_enabled() || !y.requires_grad(), "photometric_loss: no gradient is made of y");
   const bool with_grad = at::GradMode::is_enabled() && x.requires_grad();
   const auto out = PhotometricLoss::apply(x, y, Weights{valid, l1_weight, ssim_weight, offset}, with_grad);
   return {out[0], out[1], out[2]};
