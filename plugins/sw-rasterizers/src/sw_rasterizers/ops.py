@@ -132,17 +132,18 @@ class _Rasterize(torch.autograd.Function):
 
 def _updates(tensors: dict[str, Tensor | None]) -> tuple[list[Tensor], list[float]]:
     """Tensors and rates of the updates that the backward pass on CUDA is to do, of sh_dc, of sh_rest; or nothing."""
-    waiting = [None if (param := tensors.get(name)) is None else (param, offered_update(param)) for name in UPDATED]
-    if all(entry is None or entry[1] is None for entry in waiting):
+    offers = [None if (param := tensors.get(name)) is None else offered_update(param) for name in UPDATED]
+    if all(u is None for u in offers):
         return [], []
     updated: list[Tensor] = []
     rates: list[float] = []
-    for entry in waiting:
-        if entry is None or (u := entry[1]) is None:
+    for name, u in zip(UPDATED, offers, strict=True):
+        param = tensors.get(name)
+        if param is None or u is None:
             updated += [torch.empty(0)] * 3
             rates += [0.0] * 6
             continue
-        updated += [entry[0], u.exp_avg, u.exp_avg_sq]
+        updated += [param, u.exp_avg, u.exp_avg_sq]
         rates += [
             u.lr / (1 - u.beta1**u.step),
             1 - u.beta1,
@@ -194,19 +195,10 @@ def _nonempty(x: Tensor | None) -> Tensor | None:
     return None if x is None or x.numel() == 0 else x.contiguous()
 
 
-def _color_channels(tensors: list[Tensor | None]) -> int:
-    colors = tensors[INPUTS.index("colors")]
-    return 3 if colors is None else colors.shape[1]
-
-
-def _feature_channels(tensors: list[Tensor | None]) -> int:
-    features = tensors[INPUTS.index("features")]
-    return 0 if features is None else features.shape[1]
-
-
 def _channels(tensors: list[Tensor | None], flags: Flag) -> int:
+    colors, features = (tensors[INPUTS.index(name)] for name in ("colors", "features"))
     depths = (Flag.INVERSE_DEPTH in flags) + (Flag.ACCUMULATED_DEPTH in flags)
-    return _color_channels(tensors) + depths + _feature_channels(tensors)
+    return (3 if colors is None else colors.shape[1]) + depths + (0 if features is None else features.shape[1])
 
 
 def rasterize(call: Call, tensors: dict[str, Tensor | None]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -223,11 +215,11 @@ def rasterize(call: Call, tensors: dict[str, Tensor | None]) -> tuple[Tensor, Te
     if not differentiable and not (recording and (call.grad2d is not None or call.absgrad2d is not None)):
         drawn = _draw(call, [None if x is None else x.detach().contiguous() for x in inputs])
         return drawn.image, drawn.radii, drawn.alpha, drawn.median
-    call.flags |= Flag.SAVE
     means = tensors["means"]
     assert means is not None
     if means.is_cuda:
         return _draw_on_cuda(call, tensors)
+    call.flags |= Flag.SAVE
     # Statistics are wanted even if no input needs a gradient.
     dummy = None if differentiable else torch.empty(0, requires_grad=True)
     return _Rasterize.apply(call, dummy, *inputs)  # type: ignore[no-any-return]

@@ -220,10 +220,26 @@ std::vector<Tensor> sw::cuda::project_backward_on_cuda(const Inputs& in, const D
   StageClock clock{(flags & kCount) != 0, stream, {}};
   clock.mark();
 
+  // An update whose gradient is not asked for keeps waiting; one that is done here leaves none.
+  ShAdam adam{};
   const std::vector<Tensor>& updated = call.updated;
-  const auto updates = [&](size_t first) { return updated[first].defined() && updated[first].numel() > 0; };
-  for (size_t i = 0; i < updated.size(); i += 3)
-    if (updates(i)) wanted[i == 0 ? kWantShDc : kWantShRest] = false;
+  for (size_t i = 0; i < updated.size(); i += 3) {
+    const OptionalTensor& like = i == 0 ? in.sh_dc : in.sh_rest;
+    bool& asked = wanted[i == 0 ? kWantShDc : kWantShRest];
+    if (!asked || updated[i].numel() == 0) continue;
+    asked = false;
+    TORCH_CHECK(like.has_value() && updated[i].data_ptr() == like->data_ptr(),
+                "sw_rasterizers: Adam in the backward pass is of the tensors that were drawn");
+    for (size_t k = i; k < i + 3; ++k)
+      TORCH_CHECK(updated[k].is_contiguous() && updated[k].sizes() == like->sizes() &&
+                      updated[k].scalar_type() == at::kFloat && updated[k].device() == means.device() &&
+                      reinterpret_cast<uintptr_t>(updated[k].data_ptr()) % 16 == 0,
+                  "sw_rasterizers: parameter and moments must be contiguous float32 of shape ", like->sizes());
+    const double* r = call.rates.data() + 2 * i;
+    RowAdam& of = i == 0 ? adam.dc : adam.rest;
+    of = RowAdam{data<float>(updated[i]), data<float>(updated[i + 1]), data<float>(updated[i + 2]),
+                 float(r[0]), float(r[1]), float(r[2]), float(r[3]), float(r[4]), float(r[5])};
+  }
   std::vector<Tensor> grads(kWantedCount);
   const bool shared = in.geom_indices.has_value();  // then the rows of shapes are summed up, starting at 0
   const auto want = [&](int which, const OptionalTensor& like) {
@@ -255,24 +271,11 @@ std::vector<Tensor> sw::cuda::project_backward_on_cuda(const Inputs& in, const D
   out.grad2d = screen(call.grad2d);
   out.absgrad2d = screen(call.absgrad2d);
   const Rows rows{data<float>(row_memory), length, channels.total(), absgrad, median, (flags & kFragments) != 0};
-  ShAdam adam{};
-  for (size_t i = 0; i < updated.size(); i += 3) {
-    const OptionalTensor& like = i == 0 ? in.sh_dc : in.sh_rest;
-    if (!updates(i)) continue;
-    TORCH_CHECK(like.has_value() && updated[i].data_ptr() == like->data_ptr(),
-                "sw_rasterizers: Adam in the backward pass is of the tensors that were drawn");
-    for (size_t k = i; k < i + 3; ++k)
-      TORCH_CHECK(updated[k].is_contiguous() && updated[k].sizes() == like->sizes() &&
-                      updated[k].scalar_type() == at::kFloat && updated[k].device() == means.device() &&
-                      reinterpret_cast<uintptr_t>(updated[k].data_ptr()) % 16 == 0,
-                  "sw_rasterizers: parameter and moments must be contiguous float32 of shape ", like->sizes());
-    const double* r = call.rates.data() + 2 * i;
-    RowAdam& of = i == 0 ? adam.dc : adam.rest;
-    of = RowAdam{data<float>(updated[i]), data<float>(updated[i + 1]), data<float>(updated[i + 2]),
-                 float(r[0]), float(r[1]), float(r[2]), float(r[3]), float(r[4]), float(r[5])};
-  }
   if (n > 0) project_backward(view, g, in.settings(), channels, data<uint8_t>(drawn), rows, out, adam, stream);
   C10_CUDA_KERNEL_LAUNCH_CHECK();
+  // Whoever offered an update sees by the version that it is done.
+  if (adam.dc.param != nullptr) updated[0].unsafeGetTensorImpl()->bump_version();
+  if (adam.rest.param != nullptr) updated[3].unsafeGetTensorImpl()->bump_version();
   clock.mark();
   seconds = clock.seconds();
   return grads;

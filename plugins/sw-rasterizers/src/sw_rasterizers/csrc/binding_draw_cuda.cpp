@@ -9,7 +9,6 @@
 #include <torch/csrc/autograd/custom_function.h>
 #include <torch/library.h>
 
-#include <algorithm>
 #include <array>
 #include <mutex>
 #include <tuple>
@@ -87,7 +86,6 @@ struct Project : Function<Project> {
     call->gaussians = in.means.size(0), call->channels = in.channels();
     call->drawn = render_on_cuda(in, call->camera, call->width, call->height);
     auto& saved = std::get<4>(call->drawn);
-    stored.resize(size_t(std::count(call->present.begin(), call->present.end(), true)));
     stored.push_back(saved.back());  // the flags of the Gaussians
     saved.pop_back();
     const auto real = in.means.options().requires_grad(false);
@@ -106,22 +104,15 @@ struct Project : Function<Project> {
     size_t edge = 0;
     for (size_t i = 0; i < size_t(kInputs); ++i)
       if (call->present[i]) wanted[i] = ctx->needs_input_grad(edge++);
-    // An update whose gradient is not asked for keeps waiting.
-    for (const int i : {0, 1})
-      if (!call->updated.empty() && !wanted[i == 0 ? kWantShDc : kWantShRest]) call->updated[size_t(3 * i)].reset();
     std::vector<double> seconds;
     const Inputs in = call->inputs(given);
     auto found = project_backward_on_cuda(in, *call, stored.back(), rows[0].contiguous(), wanted, seconds);
     report(*call, project_seconds, std::move(seconds));
-    // Whoever offered the updates sees by the version that they are done.
-    for (size_t i = 0; i < call->updated.size(); i += 3)
-      if (call->updated[i].defined() && call->updated[i].numel() > 0)
-        call->updated[i].unsafeGetTensorImpl()->bump_version();
     call->updated.clear();
     variable_list out(1);
     for (size_t i = 0; i < size_t(kInputs); ++i)
       if (call->present[i]) out.push_back(std::move(found[i]));
-    out.resize(out.size() + 1);  // the one that nothing is asked of
+    out.resize(out.size() + 1);  // of the one that only makes the backward pass happen
     return out;
   }
 };
@@ -188,7 +179,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, std::vector<int64_t>, std::vector<dou
     differentiable |= given[i]->requires_grad();
   }
   // Statistics are wanted even if no input needs a gradient.
-  inputs.push_back(at::empty({0}).set_requires_grad(!differentiable));
+  if (!differentiable) inputs.push_back(at::empty({0}).set_requires_grad(true));
   const Tensor stand_in = Project::apply(call, at::TensorList(inputs));
   const variable_list out = Blend::apply(call, stand_in);
   auto counts = std::move(std::get<5>(call->drawn));
