@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from splatwizard_native.files import sweep as sweep
     from splatwizard_native.files import write_atomic as write_atomic
     from splatwizard_native.files import write_json as write_json
+    from splatwizard_native.fused.activations import activated as activated
     from splatwizard_native.fused.adam import AdamUpdate as AdamUpdate
     from splatwizard_native.fused.adam import adam_steps as adam_steps
     from splatwizard_native.fused.in_backward import end_offer as end_offer
@@ -77,6 +78,7 @@ MODULES = {
         "sweep write_atomic write_json"
     ),
     "lending": "lend",
+    "fused.activations": "activated",
     "fused.adam": "AdamUpdate adam_steps",
     "fused.in_backward": "end_offer offer_update offered_update",
     "fused.photometric": "Padding photometric",

@@ -10,7 +10,7 @@ TRAINING = NativeModule(
     sources=("kernels/binding.cpp", "kernels/binding_cuda.cpp"),
     kernels=("kernels/ssim.cpp", "kernels/adam.cpp"),
     headers=("kernels/*.h", "kernels/cuda/*.h"),
-    cuda_sources=("kernels/cuda/ssim.cu", "kernels/cuda/adam.cu"),
+    cuda_sources=("kernels/cuda/ssim.cu", "kernels/cuda/adam.cu", "kernels/cuda/activations.cu"),
     # Without these two GCC keeps sqrt and division out of vector code. No -ffinite-math-only: a NaN in the image
     # must reach the loss, where the trainer looks for it.
     cflags=("-fno-math-errno", "-fno-trapping-math"),

@@ -54,9 +54,11 @@ sw::cuda::Rendered sw::cuda::render_on_cuda(const Inputs& in, at::ArrayRef<doubl
             tally.published, stream);
     tally.projected();
     if (g.colors == nullptr || g.color_channels == 3)
-      shade(view, g, settings, splats, data<int32_t>(radii), data<uint8_t>(flags), tally.counters, stream);
+      shade(view, g, settings, splats, data<int32_t>(radii), data<uint8_t>(flags), tally.counters,
+            tally.published, stream);
     if (general)
-      fill_channels(g, channels, splats, work, data<int32_t>(radii), data<uint8_t>(flags), tally.counters, stream);
+      fill_channels(g, channels, splats, work, data<int32_t>(radii), data<uint8_t>(flags), tally.counters,
+            tally.published, stream);
     tally.shaded(settings);
   }
   clock.mark();

@@ -121,7 +121,6 @@ struct Tally {
   Counters* counters;
   uint64_t* states;  // of the projection's prefix sums, then of the emission's
   Published* published;
-  Counters* after;  // the colours
   bool used = false, under_way = true;  // under_way: the device may still write into the mailbox
 
   Tally(int64_t gaussians, const at::TensorOptions& options, cudaStream_t stream)
@@ -131,11 +130,9 @@ struct Tally {
     counters = reinterpret_cast<Counters*>(memory.data_ptr());
     states = reinterpret_cast<uint64_t*>(counters + 1);
     C10_CUDA_CHECK(cudaMemsetAsync(counters, 0, bytes, stream));
-    static_assert(sizeof(Published) + sizeof(Counters) <= 16 * sizeof(int64_t));
+    static_assert(sizeof(Published) <= 16 * sizeof(int64_t));
     published = reinterpret_cast<Published*>(mailbox.pinned.data_ptr());
-    after = reinterpret_cast<Counters*>(published + 1);
     *published = {};
-    *after = {};
   }
   // Where an error ends the call early: the next one, maybe on another stream, finds the mailbox at rest.
   ~Tally() {
@@ -147,7 +144,6 @@ struct Tally {
   void projected() { mailbox.counted.record(stream); }
   // The colours are launched: waits for the counts of the projection, while they are still being computed.
   void shaded(const Settings& settings) {
-    C10_CUDA_CHECK(cudaMemcpyAsync(after, counters, sizeof(Counters), cudaMemcpyDeviceToHost, stream));
     mailbox.colored.record(stream);
     C10_CUDA_KERNEL_LAUNCH_CHECK();
     mailbox.counted.wait();
@@ -170,7 +166,7 @@ struct Tally {
       C10_CUDA_CHECK(cudaStreamSynchronize(stream));
       evaluated = int64_t(now.evaluated), blended = int64_t(now.blended);
     }
-    const int64_t bad = after->bad_colors;
+    const auto bad = int64_t(published->bad_colors);
     return {published->visible - bad, pairs(), evaluated, blended, published->invalid + bad};
   }
 

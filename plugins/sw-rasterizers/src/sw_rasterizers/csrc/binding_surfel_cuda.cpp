@@ -64,7 +64,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, std::vector<Tensor>, std::vector<int6
     project_surfels(view, g, settings, projected.splats, projected.work, data<int32_t>(radii), data<uint8_t>(drawn),
                     tally.counters, tally.states, tally.published, stream);
     tally.projected();
-    shade(view, g, settings, projected.splats, data<int32_t>(radii), data<uint8_t>(drawn), tally.counters, stream);
+    shade(view, g, settings, projected.splats, data<int32_t>(radii), data<uint8_t>(drawn), tally.counters,
+          tally.published, stream);
     tally.shaded(settings);
   }
   clock.mark();

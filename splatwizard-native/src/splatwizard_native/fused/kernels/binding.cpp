@@ -82,6 +82,7 @@ TORCH_LIBRARY(splatwizard_training, m) {
   // On CUDA, differentiable: offset + weighted sum, L1, SSIM, none of which the host waits for; see binding_cuda.cpp.
   m.def("photometric_loss(Tensor x, Tensor y, bool valid, float l1_weight, float ssim_weight, float offset)"
         " -> (Tensor total, Tensor l1, Tensor similarity)");
+  m.def("activate(Tensor log_scales, Tensor opacity_logits) -> (Tensor scales, Tensor opacities)");  // on CUDA
   m.def("adam_many(Tensor(a!)[] params, Tensor[] grads, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs, float[] lrs,"
         " float[] beta1s, float[] beta2s, float[] epss, int[] steps) -> int[]");
   m.impl("photometric", c10::DispatchKey::CPU, TORCH_FN(photometric));

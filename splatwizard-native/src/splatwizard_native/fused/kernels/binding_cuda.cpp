@@ -122,6 +122,59 @@ std::tuple<at::Tensor, at::Tensor, at::Tensor> photometric_loss(const at::Tensor
   return {out[0], out[1], out[2]};
 }
 
+// exp and sigmoid of a model's raw parameters as one node of autograd.
+struct Activate : torch::autograd::Function<Activate> {
+  static torch::autograd::variable_list forward(torch::autograd::AutogradContext* ctx, const at::Tensor& log_scales,
+                                                const at::Tensor& logits) {
+    const at::AutoDispatchBelowADInplaceOrView plain;
+    const c10::cuda::CUDAGuard guard(log_scales.device());
+    const at::Tensor from_scales = log_scales.contiguous(), from_logits = logits.contiguous();
+    check(from_scales, "activate", "log_scales");
+    check(from_logits, "activate", "opacity_logits");
+    TORCH_CHECK(logits.device() == log_scales.device(), "activate: the tensors are on different GPUs");
+    const at::Tensor scales = at::empty_like(from_scales), opacities = at::empty_like(from_logits);
+    kernels::activate({from_scales.const_data_ptr<float>(), scales.numel(), from_logits.const_data_ptr<float>(),
+                       opacities.numel()},
+                      scales.mutable_data_ptr<float>(), opacities.mutable_data_ptr<float>(),
+                      c10::cuda::getCurrentCUDAStream());
+    C10_CUDA_KERNEL_LAUNCH_CHECK();
+    ctx->set_materialize_grads(false);
+    ctx->save_for_backward({scales, opacities});
+    return {scales, opacities};
+  }
+
+  static torch::autograd::variable_list backward(torch::autograd::AutogradContext* ctx,
+                                                 const torch::autograd::variable_list& grads) {
+    TORCH_CHECK(!at::GradMode::is_enabled(),
+                "activate: gradients cannot be differentiated again on CUDA (create_graph=True)");
+    const at::AutoDispatchBelowADInplaceOrView plain;
+    const auto saved = ctx->get_saved_variables();
+    const c10::cuda::CUDAGuard guard(saved[0].device());
+    torch::autograd::variable_list out(2);
+    const float* given[2] = {nullptr, nullptr};
+    float* made[2] = {nullptr, nullptr};
+    at::Tensor whole[2];
+    int64_t counts[2] = {0, 0};
+    for (const int i : {0, 1}) {
+      if (!grads[size_t(i)].defined() || !ctx->needs_input_grad(size_t(i))) continue;
+      whole[i] = grads[size_t(i)].contiguous();
+      out[size_t(i)] = at::empty_like(saved[size_t(i)]);
+      given[i] = whole[i].const_data_ptr<float>(), made[i] = out[size_t(i)].mutable_data_ptr<float>();
+      counts[i] = whole[i].numel();
+    }
+    const kernels::Activations activated{saved[0].const_data_ptr<float>(), counts[0], saved[1].const_data_ptr<float>(),
+                                         counts[1]};
+    kernels::activate_backward(activated, given[0], given[1], made[0], made[1], c10::cuda::getCurrentCUDAStream());
+    C10_CUDA_KERNEL_LAUNCH_CHECK();
+    return out;
+  }
+};
+
+std::tuple<at::Tensor, at::Tensor> activate(const at::Tensor& log_scales, const at::Tensor& opacity_logits) {
+  const auto out = Activate::apply(log_scales, opacity_logits);
+  return {out[0], out[1]};
+}
+
 // One step of many tensors, in one launch. Returns the places of those that the kernel cannot take: they are left as
 // they were.
 std::vector<int64_t> adam_many(const std::vector<at::Tensor>& params, const std::vector<at::Tensor>& grads,
@@ -164,6 +217,9 @@ TORCH_LIBRARY_IMPL(splatwizard_training, CUDA, m) {
   m.impl("adam_many", adam_many);
 }
 
-TORCH_LIBRARY_IMPL(splatwizard_training, CompositeImplicitAutograd, m) { m.impl("photometric_loss", photometric_loss); }
+TORCH_LIBRARY_IMPL(splatwizard_training, CompositeImplicitAutograd, m) {
+  m.impl("photometric_loss", photometric_loss);
+  m.impl("activate", activate);
+}
 
 #endif  // SW_WITH_CUDA

@@ -26,14 +26,15 @@ namespace sw::cuda {
 // What the host must know before it can allocate; on the device while it is being counted. All zeros at the start.
 struct Counters {
   unsigned long long pairs;
-  unsigned splats, visible, invalid, bad_colors;
-  unsigned project_ticket, project_done, emit_ticket, padding;
+  unsigned splats, visible, invalid, project_ticket, project_done, emit_ticket;
   unsigned long long evaluated, blended;
 };
 
-// The same for the host, in pinned memory: written by the last block of `project`.
+// The same for the host, in pinned memory: written by the last block of `project`, but the colours that are not finite
+// by whoever finds them.
 struct Published {
   int64_t splats, pairs, visible, invalid;
+  unsigned long long bad_colors;
 };
 
 // Splats as blended: log2 alpha = A dx^2 + B dx dy + C dy^2 + level, 40 bytes each.
@@ -136,9 +137,9 @@ void project(const View<float>& view, const Gaussians<float>& g, const Settings&
              const SplatWork& work, int32_t* radii, uint8_t* flags, Counters* counters, uint64_t* states,
              Published* published, cudaStream_t stream);
 void shade(const View<float>& view, const Gaussians<float>& g, const Settings& settings, const Splats& splats,
-           int32_t* radii, uint8_t* flags, Counters* counters, cudaStream_t stream);
+           int32_t* radii, uint8_t* flags, const Counters* counters, Published* published, cudaStream_t stream);
 void fill_channels(const Gaussians<float>& g, const Channels& channels, const Splats& splats, const SplatWork& work,
-                   int32_t* radii, uint8_t* flags, Counters* counters, cudaStream_t stream);
+                   int32_t* radii, uint8_t* flags, const Counters* counters, Published* published, cudaStream_t stream);
 void visible_radii(const View<float>& view, const Gaussians<float>& g, const Settings& settings, int32_t* radii,
                    cudaStream_t stream);
 

@@ -12,17 +12,20 @@ constexpr int kThreads = 128, kWarps = kThreads / kWarp;
 constexpr float kNothing = -1e30f;  // log2 of an opacity that draws nothing
 
 __device__ __forceinline__ void drop(const Splats& splats, int slot, int64_t n, int32_t* radii, uint8_t* flags,
-                                     Counters* counters) {
+                                     Published* published) {
   splats.shape[2 * int64_t(slot) + 1].y = kNothing;
   radii[n] = 0;
   if (flags != nullptr) flags[n] = 0;
-  atomicAdd(&counters->bad_colors, 1u);
+  // In the host's memory, where an addition takes long: one for all threads that are here.
+  const unsigned here = __activemask();
+  if (lane_index() == __ffs(int(here)) - 1)
+    atomicAdd(&published->bad_colors, static_cast<unsigned long long>(__popc(here)));
 }
 
 template <int kDegree>
 __global__ void __launch_bounds__(kThreads)
     shade_kernel(View<float> view, Gaussians<float> g, bool clamp_color, Splats splats, int32_t* radii, uint8_t* flags,
-                 Counters* counters) {
+                 const Counters* counters, Published* published) {
   constexpr int kBasis = (kDegree + 1) * (kDegree + 1);
   __shared__ float staged[kDegree > 0 ? kWarps * kWarp * kRestFloats : 1];
   const int slot = int(blockIdx.x * kThreads + threadIdx.x), count = int(counters->splats);
@@ -61,14 +64,14 @@ __global__ void __launch_bounds__(kThreads)
   reinterpret_cast<float2*>(splats.shape + 2 * int64_t(slot) + 1)[1] = make_float2(color[0], color[1]);
   splats.tail[slot].x = color[2];
   if (!finite)
-    drop(splats, slot, n, radii, flags, counters);
+    drop(splats, slot, n, radii, flags, published);
   else if (clamped != 0 && flags != nullptr)
     flags[n] = uint8_t(kDrawn | clamped);
 }
 
 __global__ void __launch_bounds__(kThreads)
     channels_kernel(Gaussians<float> g, Channels channels, Splats splats, SplatWork work, int32_t* radii,
-                    uint8_t* flags, Counters* counters) {
+                    uint8_t* flags, const Counters* counters, Published* published) {
   const int slot = int(blockIdx.x * kThreads + threadIdx.x);
   if (slot >= int(counters->splats)) return;
   const float4 shape = splats.shape[2 * int64_t(slot) + 1];
@@ -89,26 +92,27 @@ __global__ void __launch_bounds__(kThreads)
   if (channels.inverse) put(1.f / depth);
   if (channels.accumulated) put(depth);
   for (int k = 0; k < channels.features; ++k) put(g.features[n * channels.features + k]);
-  if (!(probe == 0.f) && shape.y != kNothing) drop(splats, slot, n, radii, flags, counters);
+  if (!(probe == 0.f) && shape.y != kNothing) drop(splats, slot, n, radii, flags, published);
 }
 
 }  // namespace
 
 void shade(const View<float>& view, const Gaussians<float>& g, const Settings& settings, const Splats& splats,
-           int32_t* radii, uint8_t* flags, Counters* counters, cudaStream_t stream) {
+           int32_t* radii, uint8_t* flags, const Counters* counters, Published* published, cudaStream_t stream) {
   const int degree = g.colors != nullptr ? 0 : g.sh_degree;
   const auto kernel = degree == 0   ? shade_kernel<0>
                       : degree == 1 ? shade_kernel<1>
                       : degree == 2 ? shade_kernel<2>
                                     : shade_kernel<3>;
   kernel<<<unsigned(ceil_div(g.count, kThreads)), kThreads, 0, stream>>>(view, g, settings.clamp_color, splats, radii,
-                                                                         flags, counters);
+                                                                         flags, counters, published);
 }
 
 void fill_channels(const Gaussians<float>& g, const Channels& channels, const Splats& splats, const SplatWork& work,
-                   int32_t* radii, uint8_t* flags, Counters* counters, cudaStream_t stream) {
+                   int32_t* radii, uint8_t* flags, const Counters* counters, Published* published,
+                   cudaStream_t stream) {
   channels_kernel<<<unsigned(ceil_div(g.count, kThreads)), kThreads, 0, stream>>>(g, channels, splats, work, radii,
-                                                                                  flags, counters);
+                                                                                  flags, counters, published);
 }
 
 }  // namespace sw::cuda
