@@ -29,8 +29,10 @@ struct Pixel {
   float gradient[kColors];
 };
 
-// What `spread_sums` does, for the sums of the plain kernel, with 9 shuffles. Lanes 8 apart lie in one column of pixels
-// and share dx, so the rows are added first, v, v dy, v dy^2 and the colours, and only then multiplied by dx and dx^2.
+// What `spread_sums` does, for the sums of the plain kernel, with 9 shuffles, and 11 for the two sums of absgrad. Lanes 8
+// apart lie in one column of pixels and share dx, so the rows are added first, v, v dy, v dy^2, the colours and the two,
+// and only then the first three are multiplied by dx and dx^2.
+template <bool kAbsgrad>
 __device__ __forceinline__ float column_sums(float v, float vy, float vyy, const float* color, float dx) {
   const bool upper = lane_index() & 16, odd_row = lane_index() & 8, odd = lane_index() & 1, second = lane_index() & 2;
   const auto swap = [](float x, int step) { return __shfl_xor_sync(kAllLanes, x, step); };
@@ -39,15 +41,26 @@ __device__ __forceinline__ float column_sums(float v, float vy, float vyy, const
   const float k2 = (upper ? color[2] : vyy) + swap(upper ? vyy : color[2], 16);
   const float p = (odd_row ? k1 : k0) + swap(odd_row ? k0 : k1, 8), q = k2 + swap(k2, 8);
   const float e1 = p * dx, e2 = odd_row ? q : e1 * dx;
-  const float one = (odd ? e1 : p) + swap(odd ? p : e1, 1), other = e2 + swap(e2, 1);
-  const bool takes_other = odd && second, gives_other = odd && !second;
+  const float one = (odd ? e1 : p) + swap(odd ? p : e1, 1);
+  float other;
+  if constexpr (kAbsgrad) {
+    const float k3 = (upper ? color[4] : color[3]) + swap(upper ? color[3] : color[4], 16), r = k3 + swap(k3, 8);
+    other = (odd ? e2 : r) + swap(odd ? r : e2, 1);
+  } else {
+    other = e2 + swap(e2, 1);
+  }
+  const bool takes_other = second && (odd || kAbsgrad), gives_other = !second && (odd || kAbsgrad);
   const float sum = (takes_other ? other : one) + swap(gives_other ? other : one, 2);
   return sum + swap(sum, 4);
 }
+template <bool kAbsgrad>
 __device__ __forceinline__ int column_index(int lane) {
-  if (lane & 4 || (lane & 3) == 2) return -1;
-  constexpr int kOf[4][3] = {{0, 1, 3}, {2, 4, 5}, {6, -1, -1}, {7, -1, 8}};  // by row of lanes: p, p dx, e2
-  return kOf[lane / 8][(lane & 3) == 0 ? 0 : (lane & 3) == 1 ? 1 : 2];
+  if (lane & 4) return -1;
+  constexpr int kNone = -1, kFirst = kAbsgrad ? 9 : kNone, kSecond = kAbsgrad ? 10 : kNone;
+  // By row of lanes: p, p dx, r, e2.
+  constexpr int kOf[4][4] = {
+      {0, 1, kFirst, 3}, {2, 4, kNone, 5}, {6, kNone, kSecond, kNone}, {7, kNone, kNone, 8}};
+  return kOf[lane / 8][lane & 3];
 }
 
 struct Chunk {  // the channels of one launch
@@ -136,8 +149,7 @@ __global__ void __launch_bounds__(kThreads)
   if (lane_index() == 0) atomicMax(&block_last, unsigned(warp_last));
   __syncthreads();
 
-  constexpr bool kPlain = !kGeneral && !kAbsgrad;
-  const int index = kPlain ? column_index(lane_index()) : spread_index<kSums>(lane_index());
+  const int index = kGeneral ? spread_index<kSums>(lane_index()) : column_index<kAbsgrad>(lane_index());
   const int column = Layout::column(index, chunk, rows.channels);
 
   for (int stop = int(block_last); stop > from; stop -= kThreads) {  // list positions [stop - kThreads, stop)
@@ -218,8 +230,8 @@ __global__ void __launch_bounds__(kThreads)
         }
         if (!any_touched) continue;
         float total;
-        if constexpr (kPlain) {
-          total = column_sums(v0, vy, vyy, sums + kMomentSums, dx);
+        if constexpr (!kGeneral) {
+          total = column_sums<kAbsgrad>(v0, vy, vyy, sums + kMomentSums, dx);
         } else {
           sums[0] = v0, sums[1] = v0 * dx, sums[2] = vy, sums[3] = sums[1] * dx, sums[4] = vy * dx, sums[5] = vyy;
           total = spread_sums<kSums>(sums);
