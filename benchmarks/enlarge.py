@@ -3,8 +3,8 @@
     python benchmarks/enlarge.py DATA/room out/room2x --factor 2
     python benchmarks/time_to_quality.py out/room2x --presets paper,fast --seeds 0,1,2 --device cuda
 
-Pictures are resampled by Lanczos and keep their file format, cameras and key points go with them. Nothing is in them that was not
-there before: PSNR and SSIM are comparable among trainings of the enlarged scene alone.
+Pictures are resampled by Lanczos and keep their file format; cameras and key points go with them. They show no more
+than before: PSNR and SSIM are comparable among trainings of the enlarged scene alone.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from dataclasses import replace
 from pathlib import Path
 
 from PIL import Image
-
-from splatwizard_core.api import SceneError, track
-from splatwizard_core.tooling import new_folder
 from sw_datasets.loaders.colmap_model import read_model, write_model
 from sw_datasets.undistort import is_pinhole
 
+from splatwizard_core.api import SceneError, track
+from splatwizard_core.tooling import new_folder
+
 
 def enlarge(scene: Path, out: Path, factor: int, *, quality: int = 90) -> None:
-    """Write `out`, a copy of the scene whose pictures are `factor` times as wide and as high; `out` is whole or not there.
+    """Write a copy of the scene whose pictures are `factor` times as wide and as high; `out` is whole or not there.
 
     quality     of the JPEG pictures, 1..100
 

@@ -8,10 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-
-from splatwizard_core.plugins.manager import load_plugins
-from splatwizard_core.scene.loading import load_scene
-from splatwizard_core.scene.dataset import SceneOptions
 from sw_datasets.loaders.colmap_model import (
     ColmapCamera,
     ColmapImage,
@@ -20,6 +16,10 @@ from sw_datasets.loaders.colmap_model import (
     read_model,
     write_model,
 )
+
+from splatwizard_core.plugins.manager import load_plugins
+from splatwizard_core.scene.dataset import SceneOptions
+from splatwizard_core.scene.loading import load_scene
 
 SCRIPT = Path(__file__).parents[1] / "benchmarks" / "enlarge.py"
 
@@ -58,7 +58,8 @@ def test_what_cannot_be_done_is_one_line(tmp_path):
     scene = write_scene(tmp_path / "scene", "SIMPLE_RADIAL", (20.0, 8.0, 6.0, 0.1))
     bent = run(scene, tmp_path / "out")
     assert bent.returncode == 1
-    assert "sw data undistort" in bent.stderr and bent.stderr.count("\n") == 1
+    assert "sw data undistort" in bent.stderr
+    assert bent.stderr.count("\n") == 1
     assert not (tmp_path / "out").exists()
     assert "is there already" in run(scene, scene).stderr
     assert run(scene, tmp_path / "out", "--factor", 1).returncode == 2
