@@ -94,6 +94,8 @@ class PluginManager:
                 self._pluggy.unregister(hooks)
                 for registry in self.registries.values():
                     registry._withdraw(info.distribution)
+        for info in filter(lambda each: each.is_core, self.broken):  # without it there is no command and no metric
+            raise PluginError(f"{info.distribution} {info.version} cannot be used: {info.error}")
 
     def _load(self, info: PluginInfo, entry_point: importlib.metadata.EntryPoint) -> None:
         hooks = None
@@ -106,13 +108,12 @@ class PluginManager:
             hooks = guarded_hooks(module, self._pluggy, functools.partial(self._guard, info))
             self._pluggy.register(hooks)
             self._pluggy.check_pending()
+            self._loaded.append((info, hooks))
         except (Exception, SystemExit) as error:  # a module that exits when it is imported must not end `sw`
             if self._pluggy.is_registered(hooks):  # with some of its hooks
                 self._pluggy.unregister(hooks)
             info.error = one_line(error)
             log.debug("plugin %s could not be loaded", info.distribution, exc_info=True)
-        else:
-            self._loaded.append((info, hooks))
 
     @contextlib.contextmanager
     def _guard(self, info: PluginInfo, hook: str, arguments: Iterable[Any]) -> Iterator[None]:
