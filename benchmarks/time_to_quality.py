@@ -48,7 +48,6 @@ from splatwizard_core.training.pipeline import TrainingRun
 MIB = 1 << 20
 CLOSE = 0.05  # dB below the end of `paper`
 PARTS: Mapping[str, Mapping[str, Any]] = {
-    "score": {"fast.score": "gradient"},
     "budget": {"fast.densify": "threshold"},
     "bound by evidence": {"fast.growth": 0.0},
     "halving": {"fast.opacity": "reset", "densify.reset_interval": 3000},
