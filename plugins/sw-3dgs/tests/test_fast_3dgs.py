@@ -157,7 +157,7 @@ def test_the_end_has_its_own_tasks_where_it_is_asked_for():
             stage_of(iterations=10_000, fast__settle=0.1, fast__late_prune=True, fast__late_views=4), PipelineParams()
         )
     )
-    assert "| average parameters          | range(9000, 10001, 10)" in plan
+    assert "| average parameters          | range(9400, 10001, 10)" in plan  # after the last pruning
     assert "| sum views                   | range(8000, 10001)" in plan
     assert "| settle learning rates       | range(8000, 10001)" in plan
     assert "| prune by views              | range(8400, 9600, 400)" in plan
