@@ -95,7 +95,7 @@ class PluginManager:
                 for registry in self.registries.values():
                     registry._withdraw(info.distribution)
         for info in filter(lambda each: each.is_core, self.broken):  # without it there is no command and no metric
-            raise PluginError(f"{info.distribution} {info.version} cannot be used: {info.error}")
+            log.warning("%s %s cannot be loaded: %s", info.distribution, info.version, info.error)
 
     def _load(self, info: PluginInfo, entry_point: importlib.metadata.EntryPoint) -> None:
         hooks = None
