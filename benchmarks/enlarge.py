@@ -50,7 +50,8 @@ def enlarge(scene: Path, out: Path, factor: int, *, quality: int = 90) -> None:
             target.parent.mkdir(parents=True, exist_ok=True)
             with Image.open(scene / "images" / image.name) as picture:
                 size = picture.width * factor, picture.height * factor
-                picture.convert("RGB").resize(size, Image.Resampling.LANCZOS).save(target, quality=quality)
+                plain = picture if picture.mode in ("RGB", "RGBA", "L") else picture.convert("RGB")
+                plain.resize(size, Image.Resampling.LANCZOS).save(target, quality=quality)
             bar.advance()
         write_model(replace(model, cameras=cameras, images=images), temporary / "sparse" / "0")
 
@@ -65,7 +66,7 @@ def main() -> None:
         parser.error("--factor must be at least 2")
     try:
         enlarge(given.scene, given.out, given.factor)
-    except SceneError as error:
+    except (SceneError, OSError) as error:
         parser.exit(1, f"{error}\n")
 
 
