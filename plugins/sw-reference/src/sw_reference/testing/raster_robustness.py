@@ -213,6 +213,17 @@ def broken_gaussians_are_culled_and_harm_no_other(r: Rasterizer, device: str) ->
             assert float(b[2:].abs().max()) == 0, what
 
 
+@check()
+def all_colors_that_are_not_finite_are_counted(r: Rasterizer, device: str) -> None:
+    n = 300
+    g = splats([[0.01 * (i % 20) - 0.1, 0.01 * (i // 20), 4] for i in range(n)], opacities=[0.5] * n)
+    assert g.colors is not None
+    g.colors[::3] = math.nan
+    result = draw(r, device, g, front_camera(), RasterOptions())
+    assert result.visible.tolist() == [i % 3 != 0 for i in range(n)]
+    assert result.stats.n_invalid in (n // 3, None)
+
+
 @check("BACKWARD", "COV3D")
 def impossible_covariance_is_culled(r: Rasterizer, device: str) -> None:
     g = splats([[0, 0, 4], [0, 0, 5]], opacities=[0.6, 0.8])
