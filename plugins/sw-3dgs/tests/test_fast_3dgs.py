@@ -38,7 +38,7 @@ SHORT = {
     "iterations": STEPS, "densify.interval": 5_000, "fast.sh_every": 3, "fast.resolution": "dash",
     "fast.resolution_hold": True, "fast.cap": 1_500, "densify.reset_interval": 10_000,
     "lr.sh_dc": 2e-2, "lr.opacity": 0.1, "fast.veto_views": 2, "fast.veto_pixels": 1,
-    "fast.settle": 0.5, "fast.average": 0.9,
+    "fast.score": "opacity_variance", "fast.settle": 0.5, "fast.average": 0.9,
 }  # fmt: skip
 """Rounds 10 steps apart, the last one at step 42; halvings at 20 and 40; from step 48 on rates fall, and the mean is
 taken of samples at 50 and 60."""

@@ -236,7 +236,7 @@ class ThreeDGSStage(Stage):
             scheduler.register_task(end, sums, name="sum views")
         begin = max(first, round(self.iterations * (1 - fast.average)))
         if fast.late_prune:  # half a round later, when the others have filled in for what the last one took
-            begin = max(begin, self.late_prunes[-1] + self.late_prunes.step // 2)
+            begin = max(begin, self.late_prunes[-1] + max(1, self.late_prunes.step // 2))
         if begin < self.iterations:
             every = min(AVERAGE_EVERY, self.iterations - begin)
             begin += (self.iterations - begin) % every
