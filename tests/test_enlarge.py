@@ -24,16 +24,22 @@ from splatwizard_core.scene.loading import load_scene
 SCRIPT = Path(__file__).parents[1] / "benchmarks" / "enlarge.py"
 
 
-def write_scene(folder: Path, model: str = "PINHOLE", params: tuple[float, ...] = (20.0, 21.0, 8.0, 6.0)) -> Path:
+def write_scene(
+    folder: Path,
+    model: str = "PINHOLE",
+    params: tuple[float, ...] = (20.0, 21.0, 8.0, 6.0),
+    picture: str = "a/0.jpg",
+    color: tuple[int, ...] = (200, 100, 50),
+) -> Path:
     camera = ColmapCamera(1, model, 16, 12, params)
-    image = ColmapImage(1, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1, "a/0.jpg", np.array([[3.5, 4.5]]), np.array([1]))
+    image = ColmapImage(1, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1, picture, np.array([[3.5, 4.5]]), np.array([1]))
     points = ColmapPoints(
         np.array([1]), np.array([[0.0, 0.0, 2.0]]), np.array([[9, 8, 7]], np.uint8), np.array([0.5]),
         np.array([0, 1]), np.array([[1, 0]], np.int32),
     )  # fmt: skip
     write_model(ColmapModel({1: camera}, {1: image}, points), folder / "sparse" / "0")
     (folder / "images" / "a").mkdir(parents=True)
-    Image.new("RGB", (16, 12), (200, 100, 50)).save(folder / "images" / "a" / "0.jpg")
+    Image.new("RGBA" if len(color) == 4 else "RGB", (16, 12), color).save(folder / "images" / picture)
     return folder
 
 
@@ -54,6 +60,16 @@ def test_all_of_a_scene_grows(tmp_path):
     assert load_scene(str(out), SceneOptions(split="all"), load_plugins()).train[0].camera.width == 48
 
 
+def test_pictures_keep_their_alpha(tmp_path):
+    scene, out = write_scene(tmp_path / "scene", picture="a/0.png", color=(200, 100, 50, 128)), tmp_path / "out"
+    assert run(scene, out).returncode == 0
+    with Image.open(out / "images" / "a" / "0.png") as picture:
+        assert picture.size == (32, 24)
+        assert picture.mode == "RGBA"
+        # Colours are resized times alpha, and rounded twice.
+        assert np.abs(np.asarray(picture, int) - (200, 100, 50, 128)).max() <= 1
+
+
 def test_what_cannot_be_done_is_one_line(tmp_path):
     scene = write_scene(tmp_path / "scene", "SIMPLE_RADIAL", (20.0, 8.0, 6.0, 0.1))
     bent = run(scene, tmp_path / "out")
@@ -63,6 +79,12 @@ def test_what_cannot_be_done_is_one_line(tmp_path):
     assert not (tmp_path / "out").exists()
     assert "is there already" in run(scene, scene).stderr
     assert run(scene, tmp_path / "out", "--factor", 1).returncode == 2
+    lacking = write_scene(tmp_path / "lacking")
+    (lacking / "images" / "a" / "0.jpg").unlink()
+    lost = run(lacking, tmp_path / "out")
+    assert lost.returncode == 1
+    assert "0.jpg" in lost.stderr
+    assert "Traceback" not in lost.stderr
 
 
 @pytest.mark.parametrize("broken", ["sparse/0/cameras.bin", "images/a/0.jpg"])

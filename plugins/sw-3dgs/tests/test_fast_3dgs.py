@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from sw_gaussians.averaging import AverageParameters
 from sw_gaussians.cadence import CadencedOptimizer
 from sw_gaussians.config import Fast, GaussianTraining
 from sw_gaussians.fast import FAST
@@ -182,6 +183,14 @@ def test_parts_of_an_end_that_does_not_come_are_refused(key, value):
 def test_an_average_over_few_steps_has_two_samples():
     pre, _ = build_schedulers(stage_of(iterations=10_000, fast__average=0.0005), PipelineParams())
     assert "range(9995, 10001, 5)" in {str(entry.when) for entry in pre.registrations}
+
+
+@pytest.mark.parametrize("steps", [30, 49, 300, 9_000])  # in the first two a prune comes at every step
+def test_no_average_crosses_a_late_pruning(steps):
+    stage = stage_of(iterations=steps, fast__late_prune=True)
+    pre, _ = build_schedulers(stage, PipelineParams())
+    (task,) = (entry.task for entry in pre.registrations if isinstance(entry.task, AverageParameters))
+    assert stage.late_prunes[-1] < task.first < task.last == steps
 
 
 @pytest.mark.parametrize("steps", [1, 2, 7])
