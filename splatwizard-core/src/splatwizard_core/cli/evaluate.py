@@ -113,6 +113,12 @@ def _print(facts: dict[str, Any]) -> None:
         kind = "diagnostic" if metric["diagnostic"] else f"{metric['direction']} is better"
         over = f", {len(facts['views'])} views" if name not in (facts["geometry"] or {}) else ""
         rows.append([name, f"{shown}  ({kind}{over})"])
+    if facts["training_psnr"] is not None:
+        low, mean = (facts["training_psnr"][name] for name in ("quantile_05", "mean"))
+        shown = ["-" if value is None else f"{value:.4f}" for value in (mean, low)]
+        rows.append(
+            ["psnr, training views", f"{shown[0]}  ({facts['train_views']} views, 5 % have {shown[1]} or less)"]
+        )
     if facts["file"]["bytes"] is not None:
         rows.append(["bytes", f"{facts['file']['bytes']:,}"])
     rows += [[name.removeprefix("num_"), f"{count:,}"] for name, count in facts["counts"].items()]
