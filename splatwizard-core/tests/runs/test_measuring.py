@@ -32,6 +32,7 @@ def runs(toy_plugins: PluginManager, tmp_path_factory: pytest.TempPathFactory):
     weights = write_backbones(tmp_path_factory.mktemp("weights"), "alex")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TORCH_HOME", str(tmp_path_factory.mktemp("torch-home")))
+        patch.delenv("SPLATWIZARD_DATA", raising=False)
 
         def once(*sets: str, **options: object) -> tuple[Record, list[str]]:
             said: list[str] = []

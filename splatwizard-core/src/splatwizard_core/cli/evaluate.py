@@ -114,11 +114,9 @@ def _print(facts: dict[str, Any]) -> None:
         over = f", {len(facts['views'])} views" if name not in (facts["geometry"] or {}) else ""
         rows.append([name, f"{shown}  ({kind}{over})"])
     if facts["training_psnr"] is not None:
-        low, mean = (facts["training_psnr"][name] for name in ("quantile_05", "mean"))
-        shown = ["-" if value is None else f"{value:.4f}" for value in (mean, low)]
-        rows.append(
-            ["psnr, training views", f"{shown[0]}  ({facts['train_views']} views, 5 % have {shown[1]} or less)"]
-        )
+        psnrs = (facts["training_psnr"][key] for key in ("mean", "quantile_05"))
+        mean, low = ("-" if value is None else f"{value:.4f}" for value in psnrs)
+        rows.append(["psnr, training views", f"{mean}  ({facts['train_views']} views, 5 % have {low} or less)"])
     if facts["file"]["bytes"] is not None:
         rows.append(["bytes", f"{facts['file']['bytes']:,}"])
     rows += [[name.removeprefix("num_"), f"{count:,}"] for name, count in facts["counts"].items()]
