@@ -18,6 +18,7 @@ PAGE = (Path(__file__).resolve().parents[1] / "docs" / "protocol.md").read_text(
 BLOCKS = {
     "codec": record.CodecBlock, "speed": record.SpeedBlock, "memory": record.MemoryBlock, "train": record.TrainBlock,
     "file": record.RecordFile, "metrics": record.MetricBlock,
+    "training_psnr": record.TrainingPsnrBlock,
 }  # fmt: skip
 
 

@@ -43,6 +43,23 @@ def test_weights_of_lpips_are_known_by_their_checksum(tmp_path, monkeypatch):
     assert not any(c.needed for c in checks.values())
 
 
+def test_weights_that_were_made_from_a_package_are_known_by_their_first_numbers(tmp_path, monkeypatch):
+    import torch
+    from lpips_backbones import random_state
+    from sw_metrics.packaged_weights import PRINTED
+
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    path = tmp_path / "hub" / "checkpoints" / lpips_weights.BACKBONES["alex"].file_name
+    path.parent.mkdir(parents=True)
+    state = random_state("alex")
+    for first, expected in ((state["features.0.weight"][0, 0, 0, :3].clone(), "broken"),
+                            (torch.tensor(PRINTED["alex"]["features.0.weight"]), "ok")):  # fmt: skip
+        state["features.0.weight"][0, 0, 0, :3] = first
+        torch.save(state, path)
+        check = next(c for c in check_lpips() if c.name == "LPIPS weights, alex")
+        assert (check.state, "checksum" in check.detail) == (expected, True)
+
+
 def test_a_package_lpips_that_is_not_installed_is_an_extra(monkeypatch):
     def absent(name: str) -> str:
         raise importlib.metadata.PackageNotFoundError(name)

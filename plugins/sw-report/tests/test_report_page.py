@@ -206,6 +206,17 @@ def test_what_an_old_record_lacks_is_a_dash(make_run):
     assert page(old, make_run("r2", size=5000)).faults == []
 
 
+def test_the_page_of_one_run_tells_the_psnr_of_training_views(make_run):
+    def measure(content):
+        content["training_psnr"] = {"mean": 35.294, "median": 35.3, "quantile_05": 33.52, "far_below": {}}
+
+    told = "Training views: PSNR 35.29 dB in the mean; 5 % of them have 33.52 dB or less."
+    one, other = make_run(change=measure), make_run("r2", change=measure)
+    assert told in page(one).text
+    assert told not in page(one, other).text
+    assert "Training views" not in page(make_run("r3")).text
+
+
 def test_different_protocols_stand_apart_and_are_flagged(make_run, tmp_path):
     make_run("r1")
     make_run("r2", change=lambda c: c["protocol"].update(id="colmap/images/r4/every8/black/pp-center/q8", resolution=4))

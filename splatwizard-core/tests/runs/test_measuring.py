@@ -32,6 +32,7 @@ def runs(toy_plugins: PluginManager, tmp_path_factory: pytest.TempPathFactory):
     weights = write_backbones(tmp_path_factory.mktemp("weights"), "alex")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TORCH_HOME", str(tmp_path_factory.mktemp("torch-home")))
+        patch.delenv("SPLATWIZARD_DATA", raising=False)
 
         def once(*sets: str, **options: object) -> tuple[Record, list[str]]:
             said: list[str] = []
@@ -127,13 +128,15 @@ def test_only_quick_metrics_are_computed_on_the_way(runs, tmp_path_factory):
 
 
 def test_an_earlier_measurement_counts_if_it_holds_all_that_is_asked():
-    asked = {"repeats": 2, "metrics": {"psnr": "core 1", "lpips_vgg": None}}
-    held = {"repeats": 3, "metrics": {"psnr": "core 1", "lpips_vgg": "weights a"}}
+    asked = {"repeats": 2, "metrics": {"psnr": "core 1", "lpips_vgg": None}, "eval_train": False}
+    held = {"repeats": 3, "metrics": {"psnr": "core 1", "lpips_vgg": "weights a"}, "eval_train": True}
     assert measures(held, asked)
+    assert not measures(asked, {**asked, "eval_train": True})
+    assert not measures({"repeats": 3, "metrics": held["metrics"]}, held)  # of a release that did not draw them
     assert measures(asked, asked)
     assert not measures({**held, "repeats": 1}, asked)
     assert not measures({**held, "metrics": {"psnr": "core 0"}}, asked)
-    assert not measures(held, {"repeats": 1, "metrics": {"lpips_vgg": "weights b"}})
+    assert not measures(held, {**asked, "metrics": {"lpips_vgg": "weights b"}})
     for damaged in (None, [], {}, {"repeats": "3", "metrics": {}}, {"repeats": 3, "metrics": None}):
         assert not measures(damaged, asked)
 

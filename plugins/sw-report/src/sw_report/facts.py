@@ -64,6 +64,13 @@ class MetricFacts(Facts):
     diagnostic: bool = False
 
 
+class TrainingPsnrFacts(Facts):
+    """PSNR over the training views, dB."""
+
+    mean: float | None = None
+    quantile_05: float | None = None
+
+
 class FileFacts(Facts):
     """Encoded file; `sections` is bytes by section."""
 
@@ -176,6 +183,7 @@ class RunFacts(Facts):
     memory: MemoryFacts = MemoryFacts()
     train: TrainFacts = TrainFacts()
     geometry: dict[Text, dict[Text, Any]] | None = None
+    training_psnr: TrainingPsnrFacts | None = None
     plan: list[StagePlan] = []
     rasterizers: dict[Text, dict[Text, Text]] = {}
     phases: list[PhaseFacts] = []

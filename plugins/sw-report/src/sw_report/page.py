@@ -24,6 +24,7 @@ from sw_report.commands import commands_table
 from sw_report.declared import metric_style
 from sw_report.distortion import bd_tables, choose_anchor, with_values
 from sw_report.dtu_table import dtu_table
+from sw_report.facts import RunFacts
 from sw_report.geometry import geometry_parts
 from sw_report.looks import looks_of
 from sw_report.pictures import (
@@ -181,7 +182,7 @@ def _single_sections(run: Run, options: PageOptions) -> list[Section]:
     parts += [Part(table=table, folded="All scores")] if table is not None else []
     missing = tables.missing_metrics([run])
     parts += [Part(text="Not known: " + "; ".join(missing) + ".")] if missing else []
-    sections.append(Section("views", VIEWS, parts, short=SHORT[VIEWS]))
+    sections.append(Section("views", VIEWS, parts, _of_training_views(facts), SHORT[VIEWS]))
     table = plots.single_sections_table(run)
     part = Part(table=table) if table is not None else Part(text="The record lists no sections of the file.")
     sections.append(Section("bytes", BYTES, [part], short=SHORT[BYTES]))
@@ -191,6 +192,14 @@ def _single_sections(run: Run, options: PageOptions) -> list[Section]:
         sections.append(Section("geometry", "Geometry", parts))
     sections.append(_provenance([run]))
     return sections
+
+
+def _of_training_views(facts: RunFacts) -> str:
+    """Tell the PSNR over the training views, which stand in no table; empty if the record does not have it."""
+    found = facts.training_psnr
+    if found is None or found.mean is None or found.quantile_05 is None:
+        return ""
+    return f"Training views: PSNR {found.mean:.2f} dB in the mean; 5 % of them have {found.quantile_05:.2f} dB or less."
 
 
 def _many_sections(runs: Sequence[Run], options: PageOptions) -> list[Section]:

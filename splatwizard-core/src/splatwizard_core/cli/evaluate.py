@@ -113,6 +113,10 @@ def _print(facts: dict[str, Any]) -> None:
         kind = "diagnostic" if metric["diagnostic"] else f"{metric['direction']} is better"
         over = f", {len(facts['views'])} views" if name not in (facts["geometry"] or {}) else ""
         rows.append([name, f"{shown}  ({kind}{over})"])
+    if facts["training_psnr"] is not None:
+        psnrs = (facts["training_psnr"][key] for key in ("mean", "quantile_05"))
+        mean, low = ("-" if value is None else f"{value:.4f}" for value in psnrs)
+        rows.append(["psnr, training views", f"{mean}  ({facts['train_views']} views, 5 % have {low} or less)"])
     if facts["file"]["bytes"] is not None:
         rows.append(["bytes", f"{facts['file']['bytes']:,}"])
     rows += [[name.removeprefix("num_"), f"{count:,}"] for name, count in facts["counts"].items()]

@@ -21,6 +21,7 @@ from splatwizard_core.runs.decode import import_method, open_model
 from splatwizard_core.runs.environment import describe_environment
 from splatwizard_core.runs.record import MemoryBlock, MetricBlock, SpeedBlock, picked
 from splatwizard_core.runs.session import Session
+from splatwizard_core.runs.training_views import training_psnr
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.scene.scene import Scene
@@ -58,7 +59,8 @@ def measure(
 
     resolved    with the scene, the settings of metrics, and the choice of rasterizers
     open_model  () -> the model on the session's device; called first, before any picture is read
-    metrics     names; None: all over images that are installed; with `geometry` all over models besides
+    metrics     names; None: all over images that are installed, and PSNR over the training views where `eval_train`
+                asks for it; with `geometry` all over models besides
     speed       also measure speed and memory
     repeats     how often speed is measured
     renders     folder for the test views as PNG, and in `geometry` what metrics over models show; None: not kept
@@ -120,6 +122,9 @@ def measure(
     subject = quality.Subject(model, scene, rasterizer, options, setup, static, renders and renders / "geometry")
     of_model = quality.evaluate_model(subject, chosen_metrics(plugins.metrics, metrics, geometry=geometry))
     results = {**result.metrics, **of_model}.items()
+    of_training, reasons = None, {"training_psnr": "not asked for (eval_train, --metrics)"}
+    if metrics is None and resolved.ppl.eval_train:  # last: the pictures are read for it alone
+        of_training, reasons = training_psnr(scene, draw(rasterizer), device)
     found = {
         "dataset": scene.protocol.dataset,
         "scene": scene.name,
@@ -129,7 +134,8 @@ def measure(
         **vars(result),
         "metrics": {name: picked(MetricBlock, asdict(metric)) for name, metric in results},
         "geometry": {name: dict(m.details) for name, m in of_model.items()} or None,
-        "unknown": {f"metrics.{name}.mean": m.reason for name, m in results if m.reason is not None},
+        "training_psnr": of_training,
+        "unknown": {f"metrics.{name}.mean": m.reason for name, m in results if m.reason is not None} | reasons,
         "digest": model.digest(),
         "counts": model.counts(),
         "speed": None,

@@ -76,6 +76,15 @@ class MetricBlock(Part):
     made_with: dict[str, str] = Field({}, description="what else the values depend on: versions, weights, checksums")
 
 
+class TrainingPsnrBlock(Part):
+    """PSNR of the decoded model over its training views, dB, by the rules of the test views."""
+
+    mean: float | None
+    median: float | None
+    quantile_05: float | None = Field(description="5 % of the views have this or less")
+    far_below: dict[str, float] = Field(description="views more than 8 dB below the median, the lowest first")
+
+
 class SpreadBlock(Part):
     """Spread of repeated measurements of one thing."""
 
@@ -225,6 +234,7 @@ class Record(Part):
     memory: MemoryBlock
     train: TrainBlock
     geometry: Annotated[dict[str, dict[str, Any]] | None, WhyNull("not asked for")] = None
+    training_psnr: Annotated[TrainingPsnrBlock | None, WhyNull("not measured")] = None
     plan: list[dict[str, Any]] = Field(description="of each stage its name, steps, tasks, and `looked_up`")
     rasterizers: dict[str, dict[str, str]] = Field(description="phase -> features asked for -> who served them")
     raster_options: dict[str, dict[str, Any]] = Field(

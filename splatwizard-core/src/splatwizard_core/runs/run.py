@@ -25,6 +25,7 @@ from splatwizard_core.runs.phases import phases_of_run
 from splatwizard_core.runs.pretrained import make_method, training_key
 from splatwizard_core.runs.session import Session, TrainedModel
 from splatwizard_core.runs.training import total_seconds, train
+from splatwizard_core.runs.training_views import collapse_warning
 from splatwizard_core.runs.versions import changes, installed, providers
 from splatwizard_native import file_sha256
 
@@ -68,14 +69,18 @@ def run(session: Session, request: RunRequest) -> tuple[schema.Record, Path]:
         # The extent of the measurement, with the packages and weights that are there now.
         setup = MetricSetup(session.device, resolved.metrics)
         wanted = chosen_metrics(session.plugins.metrics, None, geometry=request.geometry)
-        asked = {"repeats": request.repeats, "metrics": metric_identities(wanted, setup)}
+        asked = {
+            "repeats": request.repeats,
+            "metrics": metric_identities(wanted, setup),
+            "eval_train": resolved.ppl.eval_train,
+        }
         finished = steps.done("record", keys["record"])
         if finished is not None and measures(finished.get("asked"), asked):
             with contextlib.suppress(UserInputError):  # a damaged record is written again
                 record = schema.read_record(directory / schema.FILE_NAME)
                 if record.file.sha256 == encoding["sha256"]:
                     session.say(f"{directory} is finished; nothing to do (--fresh does it again)")
-                    return record, directory
+                    return _warned(session, record), directory
         training = steps.done("train", train_key) or train_in(session, request, directory).facts
         write_config(directory, resolved)
         decoded = steps.once(
@@ -92,7 +97,15 @@ def run(session: Session, request: RunRequest) -> tuple[schema.Record, Path]:
         record = _record(session, resolved, training, encoding, decoded, measured)
         record.write(directory / schema.FILE_NAME)
         steps.finish("record", keys["record"], {"sha256": encoding["sha256"], "asked": measured["asked"]})
-    return record, directory
+    return _warned(session, record), directory
+
+
+def _warned(session: Session, record: schema.Record) -> schema.Record:
+    """Return the record; the user is told if its training views show a collapse."""
+    warning = collapse_warning(record)
+    if warning is not None:
+        session.say(warning)
+    return record
 
 
 def train_only(session: Session, request: RunRequest) -> tuple[TrainedModel, Path]:
@@ -137,13 +150,14 @@ def measures(extent: Any, asked: Mapping[str, Any]) -> bool:
     """Whether a measurement of this extent, as a step remembers it (or anything), holds all that is asked for.
 
     One that holds more is kept: a run that was measured with LPIPS, or five times over, does not lose that because a
-    later command does not ask for it. An extent is `repeats` of the speed and `metrics`: name -> identity of what its
-    values depend on; None: it cannot be computed now.
+    later command does not ask for it. An extent is `repeats` of the speed, `metrics`: name -> identity of what its
+    values depend on (None: it cannot be computed now), and `eval_train`: whether training views are among it.
     """
     try:
         known = extent["metrics"]
         wanted = {name: now for name, now in asked["metrics"].items() if now is not None}
-        return bool(extent["repeats"] >= asked["repeats"]) and all(known.get(name) == wanted[name] for name in wanted)
+        enough = extent["repeats"] >= asked["repeats"] and extent.get("eval_train", False) >= asked["eval_train"]
+        return bool(enough) and all(known.get(name) == wanted[name] for name in wanted)
     except (AttributeError, KeyError, TypeError):
         return False  # damaged
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 
 import torch
 
@@ -24,6 +26,22 @@ def check_pictures(views: Iterable[View]) -> None:
     _each("check pictures", views, _decode_once)
 
 
+def decoded_ahead(views: Iterable[View]) -> Iterator[View]:
+    """Yield each view with its picture decoded, a few of them ahead on other threads; none is kept longer.
+
+    A view whose picture is decoded already is yielded itself, for any other a copy of it.
+    """
+    threads = _threads()
+    pending: deque[Future[View]] = deque()
+    with ThreadPoolExecutor(threads) as pool:
+        for view in views:
+            pending.append(pool.submit(_decoded, view))
+            if len(pending) > threads:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
+
+
 def keep_pictures(views: Iterable[View], device: torch.device | str) -> bool:
     """Keep these pictures, 8 bit, in a GPU's memory too if they take at most a quarter of what is free; else in none.
 
@@ -40,6 +58,16 @@ def keep_pictures(views: Iterable[View], device: torch.device | str) -> bool:
     return fits
 
 
+def _decoded(view: View) -> View:
+    found = view if "pixels" in vars(view) else replace(view)
+    _ = found.pixels
+    return found
+
+
+def _threads() -> int:
+    return min(8, available_cores())
+
+
 def _decode_once(view: View) -> None:
     for load in (view.load, view.load_mask):
         if load is not None:
@@ -51,7 +79,6 @@ def _each(label: str, views: Iterable[View], work: Callable[[View], object]) -> 
     pending = [view for view in views if view.load is not None and "pixels" not in vars(view)]
     if not pending:
         return
-    threads = min(8, available_cores())
-    with track(label, total=len(pending), unit="pictures") as bar, ThreadPoolExecutor(threads) as pool:
+    with track(label, total=len(pending), unit="pictures") as bar, ThreadPoolExecutor(_threads()) as pool:
         for _ in pool.map(work, pending):
             bar.advance()

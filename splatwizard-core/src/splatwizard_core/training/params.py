@@ -69,6 +69,7 @@ class PipelineParams(Params):
     log_every: int = Field(10, ge=1, description="steps between lines of log.jsonl")
     keep_checkpoints: int = Field(1, ge=1, description="how many of the newest checkpoints stay")
     eval_every: int = Field(0, ge=0, description="steps between evaluations on the test views; 0: only at the end")
+    eval_train: bool = Field(True, description="draw the training views once at the end and record their PSNR")
     random_background: bool = Field(False, description="a fresh background colour per step in training")
     clamp_render: bool = Field(False, description="clamp the render to [0,1] before the loss (inria 2024)")
     deterministic: bool = Field(False, description="equal runs give equal bits on CUDA too; slower, more memory")
@@ -78,7 +79,8 @@ class PipelineParams(Params):
 
     @model_serializer(mode="wrap")
     def _given(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        told = {"log": self.log != LogParams(), "deterministic": self.deterministic}
+        # Left out at their defaults: a configuration keeps the hash that it had before there were these keys.
+        told = {"log": self.log != LogParams(), "deterministic": self.deterministic, "eval_train": not self.eval_train}
         return {key: value for key, value in handler(self).items() if told.get(key, True)}
 
 

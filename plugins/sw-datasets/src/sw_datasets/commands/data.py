@@ -70,6 +70,7 @@ def _dataset_facts(root: Path, dataset: DataSet) -> dict[str, Any]:
         "licence": dataset.licence,
         "note": dataset.note,
         "registry": dataset.registry,
+        "package": None if dataset.package is None else dataset.package.requirement,
         "state": dataset_state(root, dataset, scenes),
         "checksum": _checksum(dataset, scenes),
         "scenes": [_scene_facts(scene) for scene in scenes],
@@ -147,6 +148,8 @@ def _print_one(facts: dict[str, Any]) -> None:
         pin = f"sha256 {file['sha256']}" if file["sha256"] else "no checksum published"
         hand = ", by hand" if file["by_hand"] else ""
         out.print(escape(f"file: {file['name']}, {size}, {pin}{hand}: {file['url']}"), soft_wrap=True)
+    if facts["package"]:
+        out.print(escape(f"where that cannot be reached: made from the package {facts['package']}"), soft_wrap=True)
     if not facts["scenes"]:
         return
     table = Table("scene", "here", "checksum", "folder")

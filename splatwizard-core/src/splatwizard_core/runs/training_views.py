@@ -1,0 +1,94 @@
+"""PSNR over the views that a model was trained on, and what it tells beside the test views: a training that collapsed.
+
+Test views alone do not say whether the model is bad or the views are new. Training views that lie far below the others
+show a part of the scene that is not there; training views far above the test views, one that was learnt by heart.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from splatwizard_core.evaluation.evaluate import INFINITE, NOT_A_NUMBER
+from splatwizard_core.evaluation.image import prepare_render, psnr
+from splatwizard_core.runs.record import Record, TrainingPsnrBlock
+from splatwizard_core.scene.camera import Camera
+from splatwizard_core.scene.images import decoded_ahead
+from splatwizard_core.scene.scene import Scene
+from splatwizard_native import track
+
+FAR_BELOW = 8.0  # dB from the median of the training views down to one that is warned of
+LARGEST_GAP = 3.0  # dB between the means of training and of test views
+MAX_NAMED = 3  # views that a warning names
+SHARE = 0.05  # of the training views that lie at or below `quantile_05`
+
+Summary = dict[str, Any]
+"""The values of a `TrainingPsnrBlock`."""
+
+
+def training_psnr(
+    scene: Scene, draw: Callable[[Camera], Tensor], device: torch.device
+) -> tuple[Summary | None, dict[str, str]]:
+    """Draw every training view once and compare, as `psnr` of the test views is computed.
+
+    draw    camera on `device` -> [3,H,W], not clamped
+
+    Returns the summary, or None, and the reason of each null by dotted name.
+    """
+    if not scene.train:
+        return None, {"training_psnr": "the scene has no training views"}
+    background, found = scene.background.to(device), dict[str, float]()
+    with track(f"training views of {scene.name}", total=len(scene.train), unit="views") as bar:
+        for view in decoded_ahead(scene.train):
+            image = prepare_render(draw(view.camera.to(device)), quantize8=scene.protocol.quantize8)
+            found[view.name] = psnr(image, view.image(background, device))
+            bar.advance()
+    return summary(found)
+
+
+def summary(values: dict[str, float]) -> tuple[Summary | None, dict[str, str]]:
+    """Summarise PSNRs by view name, dB, at least one; returns as `training_psnr` does."""
+    if any(map(math.isnan, values.values())):
+        return None, {"training_psnr": NOT_A_NUMBER}
+    ordered = sorted(values, key=lambda name: values[name])
+    median = statistics.median(values.values())
+    told = {
+        "mean": statistics.fmean(values.values()),
+        "median": median,
+        "quantile_05": values[ordered[math.ceil(SHARE * len(ordered)) - 1]],
+    }
+    finite = {name: value if math.isfinite(value) else None for name, value in told.items()}
+    reasons = {f"training_psnr.{name}": INFINITE for name, value in finite.items() if value is None}
+    far = [name for name in ordered if math.isfinite(median) and values[name] < median - FAR_BELOW]
+    return {**finite, "far_below": {name: values[name] for name in far}}, reasons
+
+
+def collapse_warning(record: Record) -> str | None:
+    """One line for the user if training views of a record tell that the training went wrong; None: they do not."""
+    training, test = record.training_psnr, record.metrics.get("psnr")
+    if training is None:
+        return None
+    told = [_far_below(training, record.train_views)] if training.far_below else []
+    means = training.mean, None if test is None else test.mean
+    if means[0] is not None and means[1] is not None and means[0] - means[1] > LARGEST_GAP:
+        told.append(
+            f"test views have {means[1]:.1f} dB in the mean, training views {means[0]:.1f}: these are learnt by heart, "
+            "or the test views are of another kind (path, exposure, poses); look at the worst of them in renders/"
+        )
+    return f"warning: {record.method} {record.rate}: {'; '.join(told)}" if told else None
+
+
+def _far_below(training: TrainingPsnrBlock, views: int) -> str:
+    names = [f"{name} {value:.1f}" for name, value in list(training.far_below.items())[:MAX_NAMED]]
+    more = len(training.far_below) - len(names)
+    listed = ", ".join(names) + (f" and {more} more" if more else "")
+    return (
+        f"{len(training.far_below)} of {views} training views lie more than {FAR_BELOW:.0f} dB below their median of "
+        f"{training.median:.1f} dB ({listed}): part of the scene is missing, or their poses are off; look at them with "
+        "`sw render --views train`, and train with another seed or more start points"
+    )
