@@ -2,13 +2,12 @@
 
 import os
 import random
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-from splatwizard_native import ForeseenError, seeded, sums_vary_on_cuda
+from splatwizard_native import ForeseenError, seeded
 
 
 def drawn() -> list[float]:
@@ -46,12 +45,14 @@ def test_torch_is_asked_for_one_order_in_the_block_alone(before, warn_only, monk
         torch.use_deterministic_algorithms(False)
 
 
-def test_sums_without_an_order_are_refused_by_name_on_a_gpu_alone():
-    on_gpu = SimpleNamespace(is_cuda=True)
-    sums_vary_on_cuda("hash grids", on_gpu)
+def test_an_environment_in_which_products_have_no_order_is_refused_by_name(monkeypatch):
+    monkeypatch.setenv("CUBLAS_WORKSPACE_CONFIG", ":0:0")
+    with (
+        pytest.raises(ForeseenError, match="deterministic=true: CUBLAS_WORKSPACE_CONFIG is ':0:0'"),
+        seeded(0, deterministic=True),
+    ):
+        raise AssertionError("the block begins")
+    assert not torch.are_deterministic_algorithms_enabled()
+    monkeypatch.setenv("CUBLAS_WORKSPACE_CONFIG", ":16:8")
     with seeded(0, deterministic=True):
-        sums_vary_on_cuda("hash grids", torch.zeros(1))
-        with pytest.raises(
-            ForeseenError, match="deterministic=true: the sums of hash grids have no fixed order on a GPU"
-        ):
-            sums_vary_on_cuda("hash grids", on_gpu)
+        assert torch.are_deterministic_algorithms_enabled()

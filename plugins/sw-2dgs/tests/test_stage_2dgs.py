@@ -70,7 +70,7 @@ def test_the_plan_is_that_of_the_authors_code():
 
 
 def test_on_a_cpu_surfels_are_drawn_by_the_same_kernel_with_deterministic_sums():
-    """Its sums have one order there; on CUDA they have none, and `deterministic=true` is refused."""
+    """Its sums always have one order there; on CUDA they have where that is asked for."""
     view, gradients = scene_of().train[0], []
     for deterministic in (False, True):
         model = surfels_from_points(points(), generator=torch.Generator().manual_seed(0))

@@ -4,10 +4,11 @@ import pytest
 import torch
 from sw_anchors.fixed_step import sample_capacity
 from sw_anchors.fused_ops import anchor_values, mean_product, take_rows, weighted_sum, widen
-from sw_anchors.neural_gaussians import spawn
+from sw_anchors.neural_gaussians import spawn, visible_gaussians
 from sw_anchors.noisy_values import Noise, noisy_values
 from sw_anchors.pool_rows import bernoulli_rows
 
+from splatwizard_native import seeded
 from sw_codecs.context.two_layers import two_layers
 
 
@@ -183,6 +184,26 @@ def test_spawning_on_a_gpu_equals_spawning_on_the_cpu():
         found.append([each.detach().cpu() for each in (*parts, *gradients)])
     for a, b in zip(*found, strict=True):
         torch.testing.assert_close(a, b, atol=1e-4, rtol=1e-3)
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_where_it_is_asked_for_gradients_of_an_anchor_are_the_same_each_time_and_those_of_the_cpu():
+    g, n, k = torch.Generator().manual_seed(0), 3000, 10
+    tensors = [torch.randn(size, generator=g) for size in ((n, k), (n, 7 * k), (n, 3 * k), (n, 3), (n, k, 3), (n, 6))]
+    masks = (torch.rand(n, k, generator=g) > 0.3).float()
+
+    def gradients(device):
+        leaves = [t.to(device).requires_grad_() for t in (*tensors, masks)]
+        found = visible_gaussians(*leaves)
+        parts = (found.means, found.opacities, found.scales, found.quats, found.colors)
+        return torch.autograd.grad(sum(part.pow(3).sum() for part in parts), leaves)
+
+    with seeded(0, deterministic=True):
+        first, *others = (gradients("cuda") for _ in range(4))
+    for i, (own, wanted) in enumerate(zip(first, gradients("cpu"), strict=True)):
+        assert all(torch.equal(own, other[i]) for other in others), i
+        torch.testing.assert_close(own.cpu(), wanted, rtol=1e-4, atol=1e-5 * float(wanted.abs().max()))
 
 
 @pytest.mark.parametrize("share", [0.0, 0.05, 0.7, 1.0])

@@ -23,6 +23,7 @@ from sw_rasterizers import plugin
 from sw_rasterizers.native import unavailable_on_cuda
 from sw_rasterizers.scoring import KINDS, PupRasterizer
 from sw_rasterizers.standard import StandardRasterizer
+from sw_rasterizers.surfel import SurfelRasterizer
 from sw_rasterizers.variants import IndexedRasterizer
 
 ON_GPU = [
@@ -53,6 +54,8 @@ def drawn(name: str):
         return drawn_from_codebooks()
     if name == "scores":
         return scores()
+    if name.startswith("surfels"):
+        return drawn_surfels(maps=name == "surfels with maps")
     options, changes = CASES[name]
     g, cam = draw_scene(replace(MANY, **changes), 3, torch.float32)
     g = cast_inputs(g, torch.float32, "cuda")
@@ -93,6 +96,20 @@ def drawn_from_codebooks():
     return {"image": result.image.detach(), **{name: leaf.grad for name, leaf in leaves.items()}}
 
 
+def drawn_surfels(*, maps: bool):
+    g, cam = draw_scene(replace(MANY, n=4000, geometry="surfels"), 3, torch.float32)
+    g = cast_inputs(g, torch.float32, "cuda")
+    leaves = {name: getattr(g, name).clone().requires_grad_() for name in ("means", "opacities", "scales", "quats")}
+    asked = {"depth": ALL_DEPTHS, "normals": True, "distortion": True} if maps else {}
+    result = SurfelRasterizer().render(replace(g, **leaves), cam, RasterOptions(grad2d=True, alpha=True, **asked))
+    shown = [result.image, result.alpha, *([result.normals, result.distortion] if maps else [])]
+    shown += [result.depth[name] for name in sorted(result.depth)]
+    draw = torch.Generator("cuda").manual_seed(5)
+    sum((x * torch.randn(x.shape, device="cuda", generator=draw)).sum() for x in shown).backward()
+    found = {name: leaf.grad for name, leaf in leaves.items()}
+    return {"image": result.image.detach(), "grad2d": result.grad2d.value, **found}
+
+
 def scores():
     g, cam = draw_scene(MANY, 3, torch.float32)
     weight = torch.rand(cam.height, cam.width, generator=torch.Generator().manual_seed(1))
@@ -107,7 +124,10 @@ def scores():
     return {**found.scores, "fisher": found.fisher, **{f"{name} alone": x for name, x in alone.scores.items()}}
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=ON_GPU) for name in [*CASES, "codebooks", "scores"]])
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=ON_GPU) for name in [*CASES, "codebooks", "scores", "surfels", "surfels with maps"]],
+)
 def test_five_calls_give_the_same_bits_and_the_values_of_the_fast_sums(name):
     fast = drawn(name)
     with seeded(0, deterministic=True):
@@ -130,11 +150,16 @@ def test_what_draws_with_ordered_sums_says_so(name):
         info.on("cuda").check_offered(Feature.FLOAT64)
 
 
-@pytest.mark.parametrize("name", ["2dgs", "flash"])
-def test_what_has_atomic_sums_on_a_gpu_is_refused_by_name(name):
-    info = RasterizerInfo.declared(plugin.register_rasterizers, name).on("cuda")
-    with pytest.raises(CapabilityError, match=f"'{name}' does not offer DETERMINISTIC"):
-        info.check_offered(Feature.DETERMINISTIC | Feature.SURFEL if name == "2dgs" else Feature.DETERMINISTIC)
+def test_surfels_are_drawn_with_ordered_sums_too():
+    info = RasterizerInfo.declared(plugin.register_rasterizers, "2dgs")
+    for device in ("cpu", "cuda"):
+        info.on(device).check_offered(Feature.DETERMINISTIC | Feature.BACKWARD | Feature.SURFEL)
+
+
+def test_what_does_not_declare_one_order_is_refused_by_name():
+    info = RasterizerInfo.declared(plugin.register_rasterizers, "flash").on("cuda")
+    with pytest.raises(CapabilityError, match="'flash' does not offer DETERMINISTIC"):
+        info.check_offered(Feature.DETERMINISTIC)
 
 
 def test_it_is_asked_for_where_torch_is():

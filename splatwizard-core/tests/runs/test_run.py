@@ -183,6 +183,26 @@ def test_a_method_that_changes_the_model_it_encodes_is_found_out(toy_plugins: Pl
         Run(toy_plugins, tmp_path)("codec.fault=mutate", "iterations=1")
 
 
+@pytest.mark.parametrize("asked", [False, True])
+def test_where_equal_bits_are_asked_for_the_file_is_written_with_sums_in_one_order(
+    asked: bool, toy_plugins: PluginManager, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    invocation, found = Run(toy_plugins, tmp_path), []
+    toy = toy_plugins.methods.load("toy")
+    encode = toy.encode
+
+    def watched(self: Any, model: Any, writer: Any) -> None:
+        found.append(torch.are_deterministic_algorithms_enabled())
+        encode(self, model, writer)
+
+    monkeypatch.setattr(toy, "encode", watched)
+    request = invocation.request("iterations=1", f"deterministic={str(asked).lower()}")
+    _, directory = train_only(invocation.session, request)
+    encode_directory(invocation.session, request.resolved, directory, tmp_path / "scene.swz")
+    assert found == [asked]
+    assert not torch.are_deterministic_algorithms_enabled()
+
+
 def test_a_decoder_that_throws_dice_is_found_out(toy_plugins: PluginManager, tmp_path: Path):
     with pytest.raises(SplatwizardError, match="got different models from the same file"):
         Run(toy_plugins, tmp_path)("codec.fault=dice", "iterations=1")

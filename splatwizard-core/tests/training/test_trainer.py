@@ -222,6 +222,23 @@ def test_a_random_background_and_pictures_composited_at_load_are_refused(toy):
         TrainingRun(*given, PipelineParams(random_background=True), None, **run)
 
 
+def test_a_rasterizer_whose_sums_have_no_order_is_refused_by_name_before_the_first_step(toy):
+    class Ordered(toy.Rasterizer):
+        info = replace(toy.Rasterizer.info, features=toy.Rasterizer.info.features | {"DETERMINISTIC"})
+
+    scene, run = toy.make_scene(), {"directory": None, "identity": {}, "trained": lambda method: None}
+    for rasterizer, refused in ((toy.Rasterizer(), True), (Ordered(), False)):
+        given = [make_stage(toy, iterations=2)], lambda: toy.make_model(scene), scene
+        training = TrainingRun(*given, PipelineParams(deterministic=True), rasterizer, **run)
+        if refused:
+            with pytest.raises(ConfigError, match="deterministic=true: rasterizer 'soft' sums in any order on cpu"):
+                training.train()
+            assert not rasterizer.backgrounds
+        else:
+            training.train()
+            assert len(rasterizer.backgrounds) == 2
+
+
 def test_a_random_background_is_fresh_each_step_and_the_same_for_render_and_truth(toy):
     seen = []
 

@@ -55,10 +55,10 @@ if TYPE_CHECKING:
     from splatwizard_native.progress import duration as duration
     from splatwizard_native.progress import track as track
     from splatwizard_native.random_states import capture_random_states as capture_random_states
+    from splatwizard_native.random_states import one_order_of_sums as one_order_of_sums
     from splatwizard_native.random_states import preserved_random_states as preserved_random_states
     from splatwizard_native.random_states import restore_random_states as restore_random_states
     from splatwizard_native.random_states import seeded as seeded
-    from splatwizard_native.random_states import sums_vary_on_cuda as sums_vary_on_cuda
     from splatwizard_native.scalars import Verdict as Verdict
     from splatwizard_native.scalars import read_scalars as read_scalars
     from splatwizard_native.settings import cache_root as cache_root
@@ -87,7 +87,7 @@ MODULES = {
     "memory": "MemoryMeter peak_rss_bytes reset_peak_rss rss_bytes synchronize",
     "module": "NativeModule",
     "progress": "Bar duration track",
-    "random_states": "capture_random_states preserved_random_states restore_random_states seeded sums_vary_on_cuda",
+    "random_states": "capture_random_states one_order_of_sums preserved_random_states restore_random_states seeded",
     "scalars": "Verdict read_scalars",
     "settings": "cache_root",
     "strict_json": "dump_strict load_strict",

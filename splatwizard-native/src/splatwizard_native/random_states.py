@@ -14,6 +14,9 @@ import torch
 
 from splatwizard_native.errors import ForeseenError
 
+WORKSPACES = ":4096:8", ":16:8"
+"""Values of CUBLAS_WORKSPACE_CONFIG with which equal products on a GPU have equal bits."""
+
 
 def capture_random_states() -> dict[str, Any]:
     """Return the process-wide states: python, numpy, torch CPU, and each CUDA device if CUDA is in use."""
@@ -50,12 +53,18 @@ def preserved_random_states() -> Iterator[None]:
 
 
 @contextmanager
-def _one_order_of_sums() -> Iterator[None]:
+def one_order_of_sums() -> Iterator[None]:
     """Let torch, and the kernels that ask it, add in an order that no timing decides; afterwards as before.
 
-    An operation that has no such order raises RuntimeError and names itself.
+    An operation that has no such order raises RuntimeError and names itself. Raises ForeseenError where the
+    environment lets the products of a GPU have none.
     """
-    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # read at the first product on a GPU
+    workspace = os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", WORKSPACES[0])  # read at the first product on a GPU
+    if workspace not in WORKSPACES:
+        raise ForeseenError(
+            f"deterministic=true: CUBLAS_WORKSPACE_CONFIG is '{workspace}', with which the products of a GPU have no "
+            f"fixed order; unset it, or set it to {' or '.join(WORKSPACES)}"
+        )
     settings: Any = torch.utils.deterministic
     asked, only_warned = (
         torch.are_deterministic_algorithms_enabled(),
@@ -71,25 +80,13 @@ def _one_order_of_sums() -> Iterator[None]:
         torch.use_deterministic_algorithms(asked, warn_only=only_warned)
 
 
-def sums_vary_on_cuda(what: str, tensor: torch.Tensor) -> None:
-    """Raise ForeseenError where deterministic algorithms are asked for, and these sums of a GPU have no fixed order.
-
-    what    the sums, as a user knows them
-    tensor  of the device that adds them
-    """
-    if tensor.is_cuda and torch.are_deterministic_algorithms_enabled():
-        raise ForeseenError(
-            f"deterministic=true: the sums of {what} have no fixed order on a GPU; leave it out, or train on the CPU"
-        )
-
-
 @contextmanager
 def seeded(seed: int, *, deterministic: bool = False) -> Iterator[None]:
     """Seed the process-wide generators in the block; afterwards they are as before.
 
     deterministic   also `torch.use_deterministic_algorithms` in the block: equal draws then give equal bits on a GPU
     """
-    with preserved_random_states(), _one_order_of_sums() if deterministic else nullcontext():
+    with preserved_random_states(), one_order_of_sums() if deterministic else nullcontext():
         digest = hashlib.sha256(f"{seed}/global".encode()).digest()
         random.seed(digest)
         np.random.seed(int.from_bytes(digest[:4], "little"))

@@ -120,12 +120,9 @@ def sample_of(draws: Tensor, valid: Tensor, share: float) -> tuple[Tensor, Tenso
     size = sample_capacity(capacity, share)
     chosen = (draws < share) & (valid > 0)
     number = chosen.cumsum(0)
-    # Numbers are filled in: `torch.where` would copy them to the GPU, which a graph cannot.
-    place = (number - 1).masked_fill(~chosen | (number > size), size)
-    rows = torch.arange(capacity, device=draws.device)
-    found = torch.full((size + 1,), capacity - 1, dtype=torch.int64, device=draws.device)
-    found = found.scatter_(0, place, rows.masked_fill(~chosen, capacity - 1))[:size]
-    return found, (rows[:size] < number[-1]).to(valid)
+    wanted = torch.arange(1, size + 1, device=draws.device)
+    found = torch.searchsorted(number, wanted).clamp_(max=capacity - 1)  # the first row that brings the number there
+    return found, (wanted <= number[-1]).to(valid)
 
 
 def sample_capacity(capacity: int, share: float) -> int:

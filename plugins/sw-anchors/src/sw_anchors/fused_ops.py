@@ -174,7 +174,8 @@ def put_rows(rows: Tensor, sources: Sequence[Tensor | None], count: int) -> list
 def add_rows(rows: Tensor, sources: Sequence[Tensor | None], into: Sequence[Tensor | None]) -> None:
     """Add row i of each float32 source [S,...] to row rows[i] of its target; a source that is None adds nothing.
 
-    rows    [S] int64, which may name one more than once
+    rows    [S] int64, which may name one more than once; on CUDA such sums have one order where all but one of the
+            rows that are added to it are zeros
     """
     pairs = [(s, t) for s, t in zip(sources, into, strict=True) if s is not None and t is not None]
     given, targets = [s for s, _ in pairs], [t for _, t in pairs]
@@ -222,7 +223,8 @@ class _TimesOnes(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         values, rows = ctx.saved_tensors
-        to_factors = grad.new_zeros(ctx.shape.numel()).index_copy_(0, rows, (grad * values).sum(dim=1))
+        (to_factors,) = put_rows(rows, [(grad * values).sum(dim=1)], ctx.shape.numel())
+        assert to_factors is not None
         return grad, to_factors.view(ctx.shape), None
 
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from splatwizard_core.api import EmptyModel, SplatOptimizer
 from sw_anchors.anchors import AnchorModel, AnchorSelection
+from sw_anchors.fused_ops import add_rows
 
 MAX_LOG_BASE_SCALE = 0.05
 """Logarithms of the base scales (columns 3 to 5) above this are lowered to it at every adjustment."""
@@ -39,12 +40,11 @@ def accumulate_anchor_statistics(
     """
     # Every index occurs once, and what was not drawn adds 0: a mask as an index would be waited for on a GPU.
     rows, seen = selection.rows, (radii > 0).to(model.offset_denom)
-    model.opacity_accum.index_add_(0, rows, selection.opacities.clamp(min=0).sum(dim=1))
-    model.anchor_denom.index_add_(0, rows, model.anchor_denom.new_ones(len(rows)))
+    sums = selection.opacities.clamp(min=0).sum(dim=1), model.anchor_denom.new_ones(len(rows))
+    add_rows(rows, sums, (model.opacity_accum, model.anchor_denom))
     norms = torch.linalg.vector_norm(gradients, dim=1).to(model.offset_grad_accum)
-    at = selection.offset_index()
-    model.offset_grad_accum.view(-1).index_add_(0, at, norms.masked_fill_(seen == 0, 0))
-    model.offset_denom.view(-1).index_add_(0, at, seen)
+    totals = model.offset_grad_accum.view(-1), model.offset_denom.view(-1)
+    add_rows(selection.offset_index(), (norms.masked_fill_(seen == 0, 0), seen), totals)
 
 
 @torch.no_grad()

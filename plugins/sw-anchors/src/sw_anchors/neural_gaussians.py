@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from splatwizard_native import sums_vary_on_cuda
 from sw_anchors.fused_heads import fits_kernel, spawn_by_kernel
 from sw_anchors.native import ANCHORS
 from sw_anchors.view_networks import Networks, network_outputs
@@ -107,11 +106,10 @@ class _ByKernel(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
-        sums_vary_on_cuda("the Gaussians of an anchor", ctx.saved_tensors[0])
         positions_learn, has_masks = ctx.needs_input_grad[4], ctx.saved_tensors[6] is not None
         contiguous = [slope.contiguous() for slope in slopes]
         *found, to_masks, to_positions = torch.ops.sw_anchors.spawn_backward(
-            *ctx.saved_tensors, contiguous, positions_learn
+            *ctx.saved_tensors, contiguous, positions_learn, torch.are_deterministic_algorithms_enabled()
         )
         to_alpha, to_geometry, to_color, to_offsets, to_scales = found
         return (

@@ -58,9 +58,9 @@ def bernoulli_rows(uniform: Tensor, count: int, share: float) -> tuple[Tensor, T
     row to the next it is a geometric number of rows.
     """
     if share >= 1:
-        gaps = torch.ones_like(uniform)
+        gaps = torch.ones_like(uniform, dtype=torch.int64)
     else:
         rate = max(-math.log1p(-share), 1e-30)
-        gaps = uniform.log().mul_(-1 / rate).floor_().add_(1).clamp_(max=count + 1)
-    places = gaps.cumsum(0)  # from 1 on
-    return places.clamp(max=count).sub_(1).to(torch.int64), (places <= count).to(uniform)
+        gaps = uniform.log().mul_(-1 / rate).floor_().add_(1).clamp_(max=count + 1).to(torch.int64)
+    places = gaps.cumsum(0)  # from 1 on; of floats a GPU may sum in any order
+    return places.clamp(max=count).sub_(1), (places <= count).to(uniform)

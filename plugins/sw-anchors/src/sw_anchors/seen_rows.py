@@ -53,9 +53,10 @@ class ExpectedRows(SeenRows):
         self._order, self._seen = order, seen
         taken = seen.cumsum(0)
         self._count = taken[-1]
-        # What is not seen, or has no place, is written behind the last one.
-        at = (taken - 1).masked_fill_(~seen, places).clamp_(max=places)
-        self.loaded, self.capacity = order.new_zeros(places + 1).scatter_(0, at, order)[:places], places
+        # Of each place the first row that brings the number of seen ones there: a scatter may write in any order.
+        wanted = torch.arange(1, places + 1, device=order.device)
+        at = torch.searchsorted(taken, wanted).clamp_(max=len(order) - 1)
+        self.loaded, self.capacity = order[at].masked_fill_(wanted > self._count, 0), places
         self._on_host, self._copied = self._count, None
         if order.is_cuda:
             self._on_host = torch.empty((), dtype=torch.int64, pin_memory=True)

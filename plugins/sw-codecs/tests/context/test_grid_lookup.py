@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from splatwizard_native import seeded
 from sw_codecs.context import hash_grid
 from sw_codecs.context.grid_lookup import fits_kernel
 from sw_codecs.context.hash_grid import HashGrid, MixedHashGrid
@@ -162,3 +163,45 @@ def test_levels_that_do_not_fit_the_table_are_refused(change, said):
     levels = {"scales": [3.0, 3.0], "lasts": [3, 3], "starts": [0, 64], "dense": [1, 1], "log2_size": 9, **change}
     with pytest.raises(RuntimeError, match=said):
         torch.ops.sw_codecs.lookup(torch.zeros(1, 3), torch.zeros(128, 2), *levels.values())
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(ON_CUDA is not None, reason=str(ON_CUDA))
+@pytest.mark.parametrize("features", [1, 2, 4, 5])
+@pytest.mark.parametrize("slope", [1.0, 1e-12, 1e12])
+def test_where_it_is_asked_for_gradients_are_the_same_each_time_and_those_of_the_fast_sums(features, slope):
+    """Thousands of places share the entries of a coarse level."""
+    grids = [
+        real(3, features).to("cuda"),
+        MixedHashGrid((6, 9, 34), (10, 66), features=features, log2_space=9, generator=generator()).to("cuda"),
+    ]
+    x = places(3, 20_000).to("cuda")
+
+    def gradients():
+        found = []
+        for grid in grids:
+            looked_up = grid(x)
+            slopes = torch.randn(looked_up.shape, generator=generator(3)).to("cuda") * slope
+            found += torch.autograd.grad((looked_up * slopes).sum(), list(grid.parameters()))
+        return found
+
+    fast = gradients()
+    with seeded(0, deterministic=True):
+        first, *others = (gradients() for _ in range(4))
+    for i, (own, atomic) in enumerate(zip(first, fast, strict=True)):
+        assert own.any()
+        assert all(torch.equal(own, other[i]) for other in others), i
+        torch.testing.assert_close(own, atomic, rtol=1e-4, atol=1e-5 * float(atomic.abs().max()))
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(ON_CUDA is not None, reason=str(ON_CUDA))
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_ordered_sums_hide_nothing_that_is_not_finite(bad):
+    grid, x = real(3, 2).to("cuda"), places(3).to("cuda")
+    with seeded(0, deterministic=True):
+        features = grid(x)
+        slopes = torch.ones_like(features)
+        slopes[5, 3] = bad
+        (found,) = torch.autograd.grad((features * slopes).sum(), grid.table)
+    assert not bool(torch.isfinite(found).all())

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from splatwizard_native import seeded
 from sw_codecs.context import plane_kernels, spatial_ar, triplane
 from sw_codecs.context.plane_kernels import fit_kernels
 from sw_codecs.context.spatial_ar import SpatialAr
@@ -125,14 +126,31 @@ def test_a_triplane_and_its_gradients_are_those_of_torch(
 
 @pytest.mark.cuda
 @needs_gpu
-def test_deterministic_algorithms_have_no_atomic_sums():
-    plane = torch.zeros(3, 2, 4, 4, device="cuda")
-    assert fit_kernels([plane])
-    torch.use_deterministic_algorithms(True)
-    try:
-        assert not fit_kernels([plane])
-    finally:
-        torch.use_deterministic_algorithms(False)
+@pytest.mark.parametrize("sizes", [(16, 32), (7, 13), (1, 2), (130,)])
+def test_where_it_is_asked_for_sums_are_the_same_each_time_and_those_of_the_fast_kernels(sizes):
+    draw = torch.Generator().manual_seed(3)
+    networks = [SpatialAr(draw).to("cuda") for _ in range(3)]
+    planes = [(torch.randn(3, 5, n, n + 1, generator=draw) * 3).to("cuda").requires_grad_() for n in sizes]
+    made = Triplane(32, 12, (1, 2), generator=draw)
+    places = torch.randint(0, 1 << 16, (20_000, 3), generator=draw)
+    slopes = torch.randn(len(places), made.width, generator=draw).to("cuda")
+    made = made.to("cuda")
+    sites = made.sites(places.to("cuda"))
+
+    def slopes_of():
+        bits = SpatialAr.joint_bits(networks, planes)
+        learning = [*planes, *(p for network in networks for p in network.parameters())]
+        features = (made.at_sites(sites) * slopes).sum()
+        by_planes = torch.autograd.grad(features, list(made.planes))
+        return [bits.detach(), *torch.autograd.grad(bits, learning), *by_planes]
+
+    assert fit_kernels(planes)
+    fast = slopes_of()
+    with seeded(0, deterministic=True):
+        first, *others = (slopes_of() for _ in range(4))
+    for i, (own, atomic) in enumerate(zip(first, fast, strict=True)):
+        assert all(torch.equal(own, other[i]) for other in others), i
+        torch.testing.assert_close(own, atomic, rtol=1e-4, atol=1e-5 * float(atomic.abs().max()))
 
 
 @pytest.mark.cuda

@@ -55,7 +55,8 @@ class ViewEvidence:
         """
         blame = self.blame.nan_to_num(0.0, 0.0, 0.0)
         low, most = blame.aminmax()
-        high = torch.kthvalue(blame, math.ceil((1 - OUTLIERS) * len(blame))).values
+        # Not torch.kthvalue, which a GPU refuses where algorithms must be deterministic.
+        high = blame.sort().values[math.ceil((1 - OUTLIERS) * len(blame)) - 1]
         high = torch.where(high > low, high, most)
         return ((blame - low) / (high - low).clamp_min(1e-30)).clamp_(0, 1)
 

@@ -107,8 +107,7 @@ def register_rasterizers(registry: Registry) -> None:
         features=SURFEL_FEATURES,
         needs=["SURFEL"],
         available="sw_rasterizers.native:unavailable",
-        # Its sums are always atomic there: their order, and so their last bits, vary from run to run.
-        on={"cuda": {**ON_CUDA, "lacks": ["FLOAT64", "DETERMINISTIC"]}},
+        on={"cuda": ON_CUDA},
         profiles=PROFILES,
         exactness="exact",
         speed=50,

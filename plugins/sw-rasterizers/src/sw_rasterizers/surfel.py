@@ -122,6 +122,7 @@ class SurfelRasterizer:
             (quirks or opt.clamp_grad == "pass", Flag.PASS_CLAMP),
             (opt.alpha or "expected" in opt.depth, Flag.ALPHA_MAP),
             (self.count, Flag.COUNT),
+            (torch.are_deterministic_algorithms_enabled(), Flag.ORDERED),
         ):
             if asked:
                 flags |= flag

@@ -28,16 +28,19 @@ from splatwizard_core.runs.pretrained import make_method
 from splatwizard_core.runs.session import Session, TrainedModel
 from splatwizard_core.runs.training import finished_directory, train
 from splatwizard_core.runs.versions import made_by
-from splatwizard_native import CoreTime, file_sha256, synchronize
+from splatwizard_native import CoreTime, file_sha256, one_order_of_sums, synchronize
 
 NEEDED_KINDS = ("method", "quantizer", "entropy model", "context model", "coder")
 """Kinds that a decoder may want again; a pruner or a rasterizer has done its work by then."""
 
 
-def encode(method: Method, model: SplatModel, raster: dict[str, Any], path: Path) -> dict[str, Any]:
+def encode(
+    method: Method, model: SplatModel, raster: dict[str, Any], path: Path, *, deterministic: bool = False
+) -> dict[str, Any]:
     """Write one file; returns the facts of the encoding, for the record and for what is done again later.
 
-    raster  what the header asks of a rasterizer
+    raster          what the header asks of a rasterizer
+    deterministic   equal models give equal bytes on CUDA too: a method may train codebooks here
 
     The clock runs from the trained model to the closed file. Raises SplatwizardError if the method changes the model.
     """
@@ -45,7 +48,8 @@ def encode(method: Method, model: SplatModel, raster: dict[str, Any], path: Path
     synchronize(model.device)
     cores, began = CoreTime(), time.perf_counter()
     writer = ContainerWriter(method.name, method.version, raster=raster)
-    with torch.no_grad(), method.plugins.recording() as loaded:
+    ordered = one_order_of_sums() if deterministic else contextlib.nullcontext()
+    with torch.no_grad(), ordered, method.plugins.recording() as loaded:
         method.encode(model, writer)
     loaded += [method.plugins.registries[kind].entry(name) for kind, name in writer.required]
     if method.name in method.plugins.methods:
@@ -96,7 +100,8 @@ def finished_training(session: Session, resolved: ResolvedConfig, directory: Pat
 def encode_directory(session: Session, resolved: ResolvedConfig, directory: Path, target: Path) -> dict[str, Any]:
     """Encode the finished training of a run directory. Raises UserInputError if it is not finished."""
     with finished_training(session, resolved, directory) as trained:
-        return encode(make_method(session.plugins, resolved), trained.model, trained.facts["raster"], target)
+        method, raster = make_method(session.plugins, resolved), trained.facts["raster"]
+        return encode(method, trained.model, raster, target, deterministic=resolved.ppl.deterministic)
 
 
 def encode_ply(session: Session, resolved: ResolvedConfig, path: Path, target: Path) -> dict[str, Any]:
@@ -109,6 +114,6 @@ def encode_ply(session: Session, resolved: ResolvedConfig, path: Path, target: P
     last = list(method.stages())[-1]
     raster = kept_header(model, last.raster_options(last.iterations, torch.zeros(3)), resolved.ppl.raster.options)
     try:
-        return encode(method, model, raster, target)
+        return encode(method, model, raster, target, deterministic=resolved.ppl.deterministic)
     except (TypeError, AttributeError) as error:
         raise UserInputError(f"method '{method.name}' does not encode a .ply of explicit Gaussians: {error}") from error

@@ -13,6 +13,7 @@ import torch
 
 from splatwizard_core.errors import CheckpointError, ConfigError
 from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.rendering.features import Feature
 from splatwizard_core.rendering.rasterizer import Rasterizer
 from splatwizard_core.scene.images import decode_all, keep_pictures
 from splatwizard_core.scene.scene import Scene
@@ -153,11 +154,24 @@ class TrainingRun:
             model = copy.deepcopy(self.trained(stage.starts_from)).requires_grad_(True).train()
         elif model is None:
             model = self.create_model()
+        self._check_order_of_sums(model.device)
         model = stage.begin(StageContext(model, self.scene, self.ppl, self.rasterizer, streams, self.trained))
         clock = None
         if self.ppl.profile == "stages":
             clock = StageClock(model.device, self.progress.breakdown.get(self.names[index]))
         return Trainer(stage, model, self.scene, self.ppl, self.rasterizer, streams, index=index, stage_clock=clock)
+
+    def _check_order_of_sums(self, device: torch.device) -> None:
+        """Raise ConfigError where equal bits are asked for, and no rasterizer of this run gives them."""
+        if not self.ppl.deterministic:
+            return
+        info = self.rasterizer.info.on(device.type)
+        if Feature.DETERMINISTIC.names - info.features:
+            raise ConfigError(
+                f"deterministic=true: rasterizer '{info.name}' sums in any order on {device.type} (it does not declare "
+                "DETERMINISTIC); `sw list-plugins` shows which one does",
+                key="deterministic",
+            )
 
     def _before(self, index: int) -> SplatModel | None:
         """Return the model that a stage begins with, rebuilt from the last checkpoints of the stages before it."""

@@ -23,7 +23,7 @@ std::vector<Tensor> spawn(const Tensor& alpha, const Tensor& geometry, const Ten
 std::vector<Tensor> spawn_backward(const Tensor& alpha, const Tensor& geometry, const Tensor& color,
                                    const Tensor& positions, const Tensor& offsets, const Tensor& scales,
                                    const std::optional<Tensor>& masks, const Tensor& drawn,
-                                   const std::vector<Tensor>& slopes, bool with_positions) {
+                                   const std::vector<Tensor>& slopes, bool with_positions, bool /*ordered*/) {
   const Arguments given{alpha, geometry, color, positions, offsets, scales, masks, drawn};
   const Anchors from = given.checked();
   const Gaussians by = slopes_of(slopes, given);
@@ -37,8 +37,9 @@ std::vector<Tensor> spawn_backward(const Tensor& alpha, const Tensor& geometry, 
 TORCH_LIBRARY(sw_anchors, m) {
   m.def("spawn(Tensor alpha, Tensor geometry, Tensor color, Tensor positions, Tensor offsets, Tensor scales,"
         " Tensor? masks, Tensor drawn) -> Tensor[]");
+  // ordered: sums of an anchor's Gaussians have one order; on a CPU they always have.
   m.def("spawn_backward(Tensor alpha, Tensor geometry, Tensor color, Tensor positions, Tensor offsets, Tensor scales,"
-        " Tensor? masks, Tensor drawn, Tensor[] slopes, bool with_positions) -> Tensor[]");
+        " Tensor? masks, Tensor drawn, Tensor[] slopes, bool with_positions, bool ordered=False) -> Tensor[]");
   m.impl("spawn", c10::DispatchKey::CPU, TORCH_FN(spawn));
   m.impl("spawn_backward", c10::DispatchKey::CPU, TORCH_FN(spawn_backward));
 }

@@ -28,13 +28,13 @@ std::vector<Tensor> spawn(const Tensor& alpha, const Tensor& geometry, const Ten
 std::vector<Tensor> spawn_backward(const Tensor& alpha, const Tensor& geometry, const Tensor& color,
                                    const Tensor& positions, const Tensor& offsets, const Tensor& scales,
                                    const std::optional<Tensor>& masks, const Tensor& drawn,
-                                   const std::vector<Tensor>& slopes, bool with_positions) {
+                                   const std::vector<Tensor>& slopes, bool with_positions, bool ordered) {
   const Arguments given{alpha, geometry, color, positions, offsets, scales, masks, drawn};
   const Anchors from = given.checked();
   const Gaussians by = slopes_of(slopes, given);
   const c10::cuda::CUDAGuard guard(alpha.device());
   Dense found(from, masks.has_value(), with_positions, alpha);
-  sw_anchors::cuda::spawn_backward(from, by, found.at, c10::cuda::getCurrentCUDAStream());
+  sw_anchors::cuda::spawn_backward(from, by, found.at, ordered, c10::cuda::getCurrentCUDAStream());
   C10_CUDA_KERNEL_LAUNCH_CHECK();
   return found.tensors;
 }

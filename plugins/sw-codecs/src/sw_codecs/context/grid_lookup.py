@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from splatwizard_native import sums_vary_on_cuda
+from sw_codecs.context.ordered_sums import largest_for_sums
 from sw_codecs.native import CODECS
 
 if TYPE_CHECKING:
@@ -36,7 +36,8 @@ def fits_kernel(grid: HashGrid, x: Tensor, values: Tensor) -> bool:
 def lookup(grid: HashGrid, x: Tensor, values: Tensor) -> Tensor:
     """Features [n, width] of places [n,d]; differentiable for the values [entries, features].
 
-    Gradients are sums in the order of the places on the CPU, for any number of threads; on CUDA they are atomic.
+    Gradients are sums in the order of the places on the CPU, for any number of threads; on CUDA they are atomic, and
+    the same in any order where torch is asked for deterministic algorithms.
     """
     found: Tensor = _Lookup.apply(values, x.detach().contiguous(), grid)  # type: ignore[no-untyped-call]
     return found
@@ -83,12 +84,12 @@ def add_sign_gradients(
 ) -> None:
     """Add to `tables` the gradients by their signs, from those of the features; arguments as of `look_up_signs`.
 
-    On the CPU they are summed in the order of the places, for any number of threads; on CUDA sums are atomic.
+    Sums as of `lookup`.
     """
-    sums_vary_on_cuda("grids of signs", x)
     first, to_features = 0, to_features.contiguous()
+    largest = largest_for_sums(to_features)
     for (axes, levels), table in zip(grids, tables, strict=True):
-        torch.ops.sw_codecs.signs_backward(x, axes, table, to_features, first, *levels)
+        torch.ops.sw_codecs.signs_backward(x, axes, table, to_features, first, *levels, largest)
         first += table.shape[1] * len(levels[0])
 
 
@@ -104,5 +105,7 @@ class _Lookup(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
         (x,) = ctx.saved_tensors
-        sums_vary_on_cuda("hash grids", x)
-        return torch.ops.sw_codecs.backward(x, gradient.contiguous(), *ctx.shape, *ctx.levels), None, None
+        found = torch.ops.sw_codecs.backward(
+            x, gradient.contiguous(), *ctx.shape, *ctx.levels, largest_for_sums(gradient)
+        )
+        return found, None, None

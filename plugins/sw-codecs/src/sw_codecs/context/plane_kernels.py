@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from sw_codecs.context.ordered_sums import largest_for_sums
 from sw_codecs.native import CODECS
 
 MOST_SIZES = 4
@@ -21,13 +22,11 @@ MOST_CELLS = 65_535 * 32
 def fit_kernels(planes: Sequence[Tensor]) -> bool:
     """Whether there are kernels for these planes [K,C,H,W], one for each size: float32 on CUDA; loads them.
 
-    Some of their sums are atomic, so there are none where torch is asked for deterministic algorithms.
+    Some of their sums are atomic; the same in any order where torch is asked for deterministic algorithms.
     """
     if not 0 < len(planes) <= MOST_SIZES or not all(p.is_cuda and p.dtype == torch.float32 for p in planes):
         return False
     if any(p.numel() >= 1 << 31 or p.shape[-2] * p.shape[-1] > MOST_CELLS for p in planes):
-        return False
-    if torch.are_deterministic_algorithms_enabled():
         return False
     return CODECS.has_cuda()
 
@@ -45,8 +44,9 @@ def plane_bits(planes: Sequence[Tensor], parameters: Tensor, *, planes_learn: bo
     Returns ([K,1060]: derivatives by the parameters, the bits, 0; derivatives by the planes of each size, or none).
     """
     found: tuple[Tensor, list[Tensor]] = torch.ops.sw_codecs.plane_bits(
-        [plane.contiguous() for plane in planes], parameters.contiguous(), planes_learn
-    )
+        [plane.contiguous() for plane in planes], parameters.contiguous(), planes_learn,
+        torch.are_deterministic_algorithms_enabled(),
+    )  # fmt: skip
     return found
 
 
@@ -67,6 +67,6 @@ def look_up_backward(cells: Tensor, weights: Tensor, slopes: Tensor, planes: Seq
     planes      for their shapes alone
     """
     found: list[Tensor] = torch.ops.sw_codecs.triplane_backward(
-        cells.contiguous(), weights.contiguous(), slopes.contiguous(), list(planes)
+        cells.contiguous(), weights.contiguous(), slopes.contiguous(), list(planes), largest_for_sums(slopes)
     )
     return found

@@ -6,6 +6,7 @@
 
 #include <splatwizard/torch_parallel.h>
 
+#include <optional>
 #include <tuple>
 
 #include "binding.h"
@@ -31,7 +32,7 @@ at::Tensor lookup(const at::Tensor& x, const at::Tensor& values, at::ArrayRef<do
 
 at::Tensor backward(const at::Tensor& x, const at::Tensor& gradient, int64_t entries, int64_t features,
                     at::ArrayRef<double> scales, at::IntArrayRef lasts, at::IntArrayRef starts, at::IntArrayRef dense,
-                    int64_t log2_size) {
+                    int64_t log2_size, const std::optional<at::Tensor>& /*largest*/) {
   TORCH_CHECK(x.dim() == 2 && features > 0, "sw_codecs: x must be [n,2 or 3]");
   const int64_t n = x.size(0), axes = x.size(1);
   const Levels levels = levels_of(scales, lasts, starts, dense, log2_size, axes, entries);
@@ -54,7 +55,7 @@ void signs_lookup(const at::Tensor& x, at::IntArrayRef axes, const at::Tensor& t
 
 void signs_backward(const at::Tensor& x, at::IntArrayRef axes, at::Tensor table, const at::Tensor& gradient,
                     int64_t first, at::ArrayRef<double> scales, at::IntArrayRef lasts, at::IntArrayRef starts,
-                    at::IntArrayRef dense, int64_t log2_size) {
+                    at::IntArrayRef dense, int64_t log2_size, const std::optional<at::Tensor>& /*largest*/) {
   const Signs at = signs_of(x, axes, table, gradient, first, scales, lasts, starts, dense, log2_size);
   SW_SELECT(signs_backward)(at, gradient.const_data_ptr<float>() + first, table.mutable_data_ptr<float>(),
                             splatwizard::torch_parallel());
@@ -100,13 +101,14 @@ std::tuple<at::Tensor, double> nearest_entries(const at::Tensor& rows, const at:
 TORCH_LIBRARY(sw_codecs, m) {
   m.def("lookup(Tensor x, Tensor values, float[] scales, int[] lasts, int[] starts, int[] dense, int log2_size)"
         " -> Tensor");
+  // With `largest`, which no number of the gradient exceeds, sums are the same in any order; on a CPU they always are.
   m.def("backward(Tensor x, Tensor gradient, int entries, int features, float[] scales, int[] lasts, int[] starts,"
-        " int[] dense, int log2_size) -> Tensor");
+        " int[] dense, int log2_size, Tensor? largest=None) -> Tensor");
   // Features of grids of signs into columns of `found`, and their gradients added to `table`.
   m.def("signs_lookup(Tensor x, int[] axes, Tensor table, Tensor(a!) found, int first, float[] scales, int[] lasts,"
         " int[] starts, int[] dense, int log2_size) -> ()");
   m.def("signs_backward(Tensor x, int[] axes, Tensor(a!) table, Tensor gradient, int first, float[] scales,"
-        " int[] lasts, int[] starts, int[] dense, int log2_size) -> ()");
+        " int[] lasts, int[] starts, int[] dense, int log2_size, Tensor? largest=None) -> ()");
   m.impl("signs_lookup", c10::DispatchKey::CPU, TORCH_FN(signs_lookup));
   m.impl("signs_backward", c10::DispatchKey::CPU, TORCH_FN(signs_backward));
   m.def("huffman_decode(Tensor bytes, Tensor counts, Tensor index) -> Tensor");

@@ -11,6 +11,7 @@
 
 #include "binding.h"
 #include "cuda/kernels.h"
+#include "sums.h"
 
 namespace {
 
@@ -44,19 +45,25 @@ at::Tensor lookup(const at::Tensor& x, const at::Tensor& values, at::ArrayRef<do
 
 at::Tensor backward(const at::Tensor& x, const at::Tensor& gradient, int64_t entries, int64_t features,
                     at::ArrayRef<double> scales, at::IntArrayRef lasts, at::IntArrayRef starts, at::IntArrayRef dense,
-                    int64_t log2_size) {
+                    int64_t log2_size, const std::optional<at::Tensor>& largest) {
   TORCH_CHECK(x.dim() == 2, "sw_codecs: x must be [n,2 or 3]");
   const int64_t n = x.size(0), axes = x.size(1);
   const Levels levels = levels_of(scales, lasts, starts, dense, log2_size, axes, entries);
   check(x, "x", x, {n, axes});
   check(gradient, "gradient", x, {n, levels.count * features});
   const c10::cuda::CUDAGuard guard(x.device());
+  const auto stream = c10::cuda::getCurrentCUDAStream();
   at::Tensor table = at::zeros({entries, features}, x.options().requires_grad(false));
   check_pairs(table, "the table", features);
-  if (n > 0)
-    sw_grid::cuda::backward(levels, int(axes), int(features), n, x.const_data_ptr<float>(),
-                            gradient.const_data_ptr<float>(), table.mutable_data_ptr<float>(),
-                            c10::cuda::getCurrentCUDAStream());
+  const float *places = x.const_data_ptr<float>(), *slopes = gradient.const_data_ptr<float>();
+  if (n > 0 && largest.has_value()) {
+    const sw_sums::Held held(*largest, table, n << axes);
+    sw_grid::cuda::backward(levels, int(axes), int(features), n, places, slopes, held.sums, stream);
+    sw_grid::cuda::add_sums(held.sums, table.numel(), table.mutable_data_ptr<float>(), stream);
+  } else if (n > 0) {
+    sw_grid::cuda::backward(levels, int(axes), int(features), n, places, slopes, table.mutable_data_ptr<float>(),
+                            stream);
+  }
   C10_CUDA_KERNEL_LAUNCH_CHECK();
   return table;
 }
@@ -80,13 +87,20 @@ void signs_lookup(const at::Tensor& x, at::IntArrayRef axes, const at::Tensor& t
 
 void signs_backward(const at::Tensor& x, at::IntArrayRef axes, at::Tensor table, const at::Tensor& gradient,
                     int64_t first, at::ArrayRef<double> scales, at::IntArrayRef lasts, at::IntArrayRef starts,
-                    at::IntArrayRef dense, int64_t log2_size) {
+                    at::IntArrayRef dense, int64_t log2_size, const std::optional<at::Tensor>& largest) {
   const Signs at = signs_of(x, axes, table, gradient, first, scales, lasts, starts, dense, log2_size);
   const c10::cuda::CUDAGuard guard(x.device());
+  const auto stream = c10::cuda::getCurrentCUDAStream();
   const float* from = gradient.const_data_ptr<float>() + first;
-  if (at.count > 0)
-    sw_grid::cuda::signs_backward(at, are_fours(at, table, from), from, table.mutable_data_ptr<float>(),
-                                  c10::cuda::getCurrentCUDAStream());
+  const bool four = are_fours(at, table, from);
+  float* to = table.mutable_data_ptr<float>();
+  if (at.count > 0 && largest.has_value()) {
+    const sw_sums::Held held(*largest, table, at.count << at.axes);
+    sw_grid::cuda::signs_backward(at, four, from, held.sums, stream);
+    sw_grid::cuda::add_sums(held.sums, table.numel(), to, stream);
+  } else if (at.count > 0) {
+    sw_grid::cuda::signs_backward(at, four, from, to, stream);
+  }
   C10_CUDA_KERNEL_LAUNCH_CHECK();
 }
 

@@ -4,10 +4,13 @@
 TORCH_LIBRARY_FRAGMENT(sw_codecs, m) {
   // Planes [K,C,H,W] of each scale and parameters [K,1058] -> [K,1060]: the gradients of the bits by the parameters, the
   // bits, 0; and the gradients by the planes, or none.
-  m.def("plane_bits(Tensor[] planes, Tensor parameters, bool planes_learn) -> (Tensor, Tensor[])");
+  // ordered: the sums of the latter have one order, in more memory; those of the former always have.
+  m.def("plane_bits(Tensor[] planes, Tensor parameters, bool planes_learn, bool ordered=False) -> (Tensor, Tensor[])");
   // Features [n, scales 3 C] of planes [3,C,H,W], rounded to multiples of 1/gain where it is not 0.
   m.def("triplane_lookup(Tensor cells, Tensor weights, Tensor[] planes, float gain) -> Tensor");
-  m.def("triplane_backward(Tensor cells, Tensor weights, Tensor slopes, Tensor[] planes) -> Tensor[]");
+  // With `largest`, which no slope exceeds, sums are the same in any order.
+  m.def("triplane_backward(Tensor cells, Tensor weights, Tensor slopes, Tensor[] planes,"
+        " Tensor? largest=None) -> Tensor[]");
 }
 
 #ifdef SW_WITH_CUDA
@@ -20,11 +23,13 @@ TORCH_LIBRARY_FRAGMENT(sw_codecs, m) {
 #include <c10/cuda/CUDAStream.h>
 
 #include <limits>
+#include <optional>
 #include <tuple>
 #include <vector>
 
 #include "cuda/plane_bits.h"
 #include "cuda/triplane.h"
+#include "sums.h"
 
 namespace {
 
@@ -47,7 +52,7 @@ void check_planes(const std::vector<Tensor>& planes, size_t most) {
 }
 
 std::tuple<Tensor, std::vector<Tensor>> plane_bits(const std::vector<Tensor>& planes, const Tensor& parameters,
-                                                   bool planes_learn) {
+                                                   bool planes_learn, bool ordered) {
   using namespace sw_planes;
   check_planes(planes, kScales);
   check(parameters, "parameters", planes[0]);
@@ -57,16 +62,21 @@ std::tuple<Tensor, std::vector<Tensor>> plane_bits(const std::vector<Tensor>& pl
   const c10::cuda::CUDAGuard guard(parameters.device());
   Planes at{};
   at.scales = int(planes.size()), at.orientations = int(k), at.channels = int(planes[0].size(1));
-  std::vector<Tensor> to;
+  std::vector<Tensor> to, parts_of_sums;
+  const auto real = parameters.options().requires_grad(false);
   for (size_t i = 0; i < planes.size(); ++i) {
     at.height[i] = int(planes[i].size(2)), at.width[i] = int(planes[i].size(3));
     at.count[i] = int64_t(at.channels) * at.height[i] * at.width[i];
     at.values[i] = planes[i].const_data_ptr<float>();
     if (planes_learn) to.push_back(at::zeros(planes[i].sizes(), planes[i].options().requires_grad(false)));
     at.to[i] = planes_learn ? to.back().mutable_data_ptr<float>() : nullptr;
+    if (planes_learn && ordered) {
+      parts_of_sums.push_back(at::empty({k * part_sums(at, int(i))}, real));
+      at.parts[i] = parts_of_sums.back().mutable_data_ptr<float>();
+    }
   }
   const int parts = sw_planes::cuda::parts_of(at);
-  Tensor partial = at::empty({k, parts, kSums}, parameters.options().requires_grad(false));
+  Tensor partial = at::empty({k, parts, kSums}, real);
   sw_planes::cuda::bits(at, parameters.const_data_ptr<float>(), partial.mutable_data_ptr<float>(),
                         c10::cuda::getCurrentCUDAStream());
   C10_CUDA_KERNEL_LAUNCH_CHECK();
@@ -112,7 +122,7 @@ Tensor triplane_lookup(const Tensor& cells, const Tensor& weights, const std::ve
 }
 
 std::vector<Tensor> triplane_backward(const Tensor& cells, const Tensor& weights, const Tensor& slopes,
-                                      const std::vector<Tensor>& planes) {
+                                      const std::vector<Tensor>& planes, const std::optional<Tensor>& largest) {
   const sw_triplane::Sites sites = sites_of(cells, weights, planes);
   check(slopes, "slopes", weights);
   TORCH_CHECK(slopes.dim() == 2 && slopes.size(0) == sites.count &&
@@ -121,17 +131,35 @@ std::vector<Tensor> triplane_backward(const Tensor& cells, const Tensor& weights
   const c10::cuda::CUDAGuard guard(weights.device());
   const auto stream = c10::cuda::getCurrentCUDAStream();
   const auto real = weights.options().requires_grad(false);
+  const bool whole = largest.has_value();
   std::vector<Tensor> held, found;
   sw_triplane::cuda::Tables tables{};
+  // A slope is that of its own scale and of all finer ones; corners may fall together.
+  sw_triplane::cuda::SumTables sums{{}, whole ? sw_sums::checked_largest(*largest, weights) : nullptr,
+                                    sites.count * sites.scales * sw_triplane::kCorners};
   for (size_t i = 0; i < planes.size(); ++i) {
-    held.push_back(at::zeros({sw_triplane::kPairs * planes[i].size(2) * planes[i].size(3), sites.channels}, real));
-    tables.of[i] = held.back().mutable_data_ptr<float>();
+    const int64_t rows = sw_triplane::kPairs * planes[i].size(2) * planes[i].size(3);
+    held.push_back(at::zeros({rows, sites.channels}, whole ? real.dtype(at::kLong) : real));
+    if (whole)
+      sums.of[i] = reinterpret_cast<sw_sums::Whole*>(held.back().mutable_data_ptr<int64_t>());
+    else
+      tables.of[i] = held.back().mutable_data_ptr<float>();
   }
-  sw_triplane::cuda::backward(sites, in_fours(sites, slopes), slopes.const_data_ptr<float>(), tables, stream);
+  const bool four = in_fours(sites, slopes);
+  const float* from = slopes.const_data_ptr<float>();
+  if (whole)
+    sw_triplane::cuda::backward(sites, four, from, sums, stream);
+  else
+    sw_triplane::cuda::backward(sites, four, from, tables, stream);
   for (size_t i = 0; i < planes.size(); ++i) {
     found.push_back(at::empty(planes[i].sizes(), real));
-    sw_triplane::cuda::transpose(tables.of[i], found.back().mutable_data_ptr<float>(), sw_triplane::kPairs,
-                                 planes[i].size(2) * planes[i].size(3), sites.channels, 0.f, stream);
+    float* const to = found.back().mutable_data_ptr<float>();
+    const int64_t places = planes[i].size(2) * planes[i].size(3);
+    if (whole)
+      sw_triplane::cuda::transpose(sw_sums::Sums{sums.of[i], sums.largest, sums.count}, to, sw_triplane::kPairs, places,
+                                   sites.channels, stream);
+    else
+      sw_triplane::cuda::transpose(tables.of[i], to, sw_triplane::kPairs, places, sites.channels, 0.f, stream);
   }
   C10_CUDA_KERNEL_LAUNCH_CHECK();
   return found;

@@ -37,7 +37,21 @@ struct Planes {
   int64_t count[kScales];  // of values of one orientation
   const float* values[kScales];
   float* to[kScales];  // gradients, which hold zeros before
+  // Where gradients are to be summed in one order: of each warp's 32 values their sums by line, those within the
+  // places of these values and those beyond. Null: they are added by atomics.
+  float* parts[kScales];  // [orientations][part_sums]
 };
+
+constexpr int kTogether = 32, kLines = kAbove + 1;  // values of a warp; lines that their neighbours are in
+
+SW_PLANES_INLINE int groups_of(const Planes& planes, int scale) {
+  return int((planes.count[scale] + kTogether - 1) / kTogether);
+}
+
+// Numbers of `parts` for one orientation of a scale: [groups][kLines][within, beyond][kTogether].
+SW_PLANES_INLINE int64_t part_sums(const Planes& planes, int scale) {
+  return int64_t(groups_of(planes, scale)) * kLines * 2 * kTogether;
+}
 
 struct Place {
   int scale, row, column;

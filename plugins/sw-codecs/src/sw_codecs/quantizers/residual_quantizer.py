@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from splatwizard_core.api import BitstreamError, ShapeError
 from sw_codecs.codebooks.kmeans import kmeans
@@ -94,8 +95,7 @@ class ResidualVectorQuantizer(nn.Module):
         symbols, found = self._search(x, books.detach())
         residual, loss = x.detach().to(books.dtype), books.new_zeros(())
         for stage in range(self.stages):
-            # On the CPU the gradient of an index is summed by several threads in any order; this one is not.
-            entries = books[stage].index_select(0, symbols[:, stage])
+            entries = _rows(books[stage], symbols[:, stage])
             loss = loss + (residual - entries).square().mean()
             residual = residual - entries.detach()
         return straight_through(x, found), loss
@@ -149,6 +149,17 @@ class ResidualVectorQuantizer(nn.Module):
         if self.codebooks is None and prefix + "codebooks" in state_dict:
             self.codebooks = nn.Parameter(torch.empty_like(state_dict[prefix + "codebooks"]))
         super()._load_from_state_dict(state_dict, prefix, *args)
+
+
+def _rows(book: Tensor, symbols: Tensor) -> Tensor:
+    """The entries of one stage [N, d]; differentiable.
+
+    On the CPU the gradient of an index is summed by several threads in any order; that of `index_select` is not, nor
+    on CUDA where algorithms must be deterministic, but there one entry after the other: `embedding` takes them apart.
+    """
+    if book.is_cuda and torch.are_deterministic_algorithms_enabled():
+        return functional.embedding(symbols, book)
+    return book.index_select(0, symbols)
 
 
 def _sum(books: Tensor, symbols: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 // CUDA.
 #ifdef SW_WITH_CUDA
 
+#include <ATen/ops/empty.h>
 #include <ATen/ops/zeros.h>
 #include <torch/library.h>
 
@@ -130,9 +131,19 @@ std::tuple<std::vector<Tensor>, std::vector<double>> render_backward(
   const Splats splats = splats_of(saved[kShape], saved[kPlanes]);
   const TileLists lists{data<int32_t>(saved[kTileStart]), data<int32_t>(saved[kSplat])};
   const ImageGradient gradient{data<float>(image_gradient), data<float>(alpha_gradient), nullptr};
-  if (saved[kSplat].numel() > 0)
+  Ordered ordered{};
+  Tensor pair_sums;
+  Grouped pairs_of_splat;
+  const int64_t pairs = saved[kSplat].numel();
+  if ((flags & kOrdered) && pairs > 0) {
+    ordered.pairs = pairs, ordered.splats = saved[kShape].size(0);
+    pair_sums = at::empty({pairs, surfel_columns(maps)}, real);
+    pairs_of_splat = Grouped(saved[kSplat], ordered.splats, stream);
+    ordered.pair_sums = data<float>(pair_sums), ordered.pairs_of_splat = pairs_of_splat.groups();
+  }
+  if (pairs > 0)
     blend_surfels_backward(view, settings, splats, lists, image_of(in, saved), gradient, data<float>(maps_gradient),
-                           data<float>(sums), stream);
+                           data<float>(sums), ordered, stream);
   C10_CUDA_KERNEL_LAUNCH_CHECK();
   clock.mark();
 

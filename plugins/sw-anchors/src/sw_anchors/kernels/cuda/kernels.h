@@ -1,4 +1,4 @@
-// The same on CUDA: plain pointers and a stream, no torch. Sums of an anchor are atomic.
+// The same on CUDA: plain pointers and a stream, no torch.
 #pragma once
 
 #include <cuda_runtime_api.h>
@@ -8,6 +8,8 @@
 namespace sw_anchors::cuda {
 
 void spawn(const Anchors& from, const Gaussians& to, cudaStream_t stream);
-void spawn_backward(const Anchors& from, const Gaussians& slope, const Gradients& to, cudaStream_t stream);
+// ordered: sums of an anchor are those of the CPU; else atomic.
+void spawn_backward(const Anchors& from, const Gaussians& slope, const Gradients& to, bool ordered,
+                    cudaStream_t stream);
 
 }  // namespace sw_anchors::cuda

@@ -28,7 +28,7 @@ constexpr int kAtLast = kAtBiases + kResiduals * 2 * kHidden, kAtWarps = kAtLast
 // Of each warp: inputs of each layer, and what is of one layer at a time: derivatives, or what the neighbours lack.
 constexpr int kAtDerivatives = kLayers * kBackward * kMatrix, kOfWarp = kAtDerivatives + kBackward * kMatrix;
 constexpr int kShared = kAtWarps + kWarps * kOfWarp;
-static_assert(kWarps * kSums <= kShared && kWarp * kNeighbors <= kBackward * kMatrix && kAtWarps % 4 == 0);
+static_assert(kTogether == kWarp && kWarps * kSums <= kShared && kWarp * kNeighbors <= kBackward * kMatrix && kAtWarps % 4 == 0);
 
 // Numbers of a tile: [columns 8 n ..][rows g twice, rows g + 8 twice].
 using Tile = float[2][4];
@@ -180,11 +180,13 @@ __device__ __forceinline__ float sum_of(float x) {
 }
 
 // Add derivatives by a value's neighbours, and by itself, to planes. Values of a warp follow each other: for each line,
-// their sums are taken first, those within the places of the 32 values and those beyond.
-__device__ __forceinline__ void add_to_plane(const Planes& planes, const Place& place, unsigned has, const float* by,
-                                             float by_itself, int lane) {
+// their sums are taken first, those within the places of the 32 values and those beyond, 32 places further on or back.
+// kOrdered: they stay in `parts`, in which the warp is number `group`.
+template <bool kOrdered>
+__device__ __forceinline__ void add_to_plane(const Planes& planes, const Place& place, int orientation, int group,
+                                             unsigned has, const float* by, float by_itself, int lane) {
 #pragma unroll
-  for (int line = 0; line <= kAbove; ++line) {
+  for (int line = 0; line < kLines; ++line) {
     float within = line == kAbove ? by_itself : 0.f, beyond = 0.f;
 #pragma unroll
     for (int i = 0; i < kNeighbors; ++i)
@@ -193,17 +195,39 @@ __device__ __forceinline__ void add_to_plane(const Planes& planes, const Place& 
         const float x = __shfl_sync(kAllLanes, has >> i & 1 ? by[i] : 0.f, from & (kWarp - 1));
         (from == (from & (kWarp - 1)) ? within : beyond) += x;
       }
-    float* const to = planes.to[place.scale] + place.at + int64_t(line - kAbove) * planes.width[place.scale];
-    // What would go beyond the planes is 0.
-    if (within != 0.f) atomicAdd(to, within);
-    if (beyond != 0.f) atomicAdd(lane < kWarp / 2 ? to + kWarp : to - kWarp, beyond);
+    if constexpr (kOrdered) {
+      const int64_t of_group = int64_t(orientation) * groups_of(planes, place.scale) + group;
+      float* const own = planes.parts[place.scale] + (of_group * kLines + line) * 2 * kTogether + lane;
+      own[0] = within, own[kTogether] = beyond;
+    } else {
+      float* const to = planes.to[place.scale] + place.at + int64_t(line - kAbove) * planes.width[place.scale];
+      // What would go beyond the planes is 0.
+      if (within != 0.f) atomicAdd(to, within);
+      if (beyond != 0.f) atomicAdd(lane < kWarp / 2 ? to + kWarp : to - kWarp, beyond);
+    }
   }
 }
 
-__host__ __device__ __forceinline__ int groups_of(const Planes& planes, int scale) {
-  return int((planes.count[scale] + kWarp - 1) / kWarp);
+// Sums of `parts` of one scale: a thread a value, blockIdx.y the orientation. See `add_to_plane` for what lies where.
+__global__ void __launch_bounds__(kThreads) gather_kernel(const __grid_constant__ Planes planes, int scale) {
+  const int64_t at = int64_t(blockIdx.x) * kThreads + threadIdx.x, count = planes.count[scale];
+  if (at >= count) return;
+  const int64_t orientation = blockIdx.y, end = int64_t(groups_of(planes, scale)) * kTogether;
+  const float* const parts = planes.parts[scale] + orientation * part_sums(planes, scale);
+  const auto part = [&](int64_t place, int line, int which) {
+    return place < 0 || place >= end
+               ? 0.f
+               : parts[((place / kTogether * kLines + line) * 2 + which) * kTogether + place % kTogether];
+  };
+  float sum = 0.f;
+  for (int line = 0; line < kLines; ++line) {
+    const int64_t place = at + int64_t(kAbove - line) * planes.width[scale];
+    sum += part(place, line, 0) + part(place % kTogether < kTogether / 2 ? place - kTogether : place + kTogether, line, 1);
+  }
+  planes.to[scale][orientation * count + at] = sum;
 }
 
+template <bool kOrdered>
 __global__ void __launch_bounds__(kThreads, kBlocksPerProcessor)
     bits_kernel(const __grid_constant__ Planes planes, const float* weights, float* partial) {
   extern __shared__ __align__(16) uint32_t shared[];
@@ -392,7 +416,7 @@ __global__ void __launch_bounds__(kThreads, kBlocksPerProcessor)
           const float4 four = *reinterpret_cast<const float4*>(by + lane * kNeighbors + i);
           around[i] = four.x, around[i + 1] = four.y, around[i + 2] = four.z, around[i + 3] = four.w;
         }
-        add_to_plane(planes, place, has, around, slope.x, lane);
+        add_to_plane<kOrdered>(planes, place, orientation, in_scale, has, around, slope.x, lane);
       }
     }
   }
@@ -453,10 +477,18 @@ int parts_of(const Planes& planes) {
 void bits(const Planes& planes, const float* weights, float* partial, cudaStream_t stream) {
   const int parts = parts_of(planes);
   if (parts == 0 || planes.orientations == 0) return;
+  bool ordered = false;
+  for (int scale = 0; scale < planes.scales; ++scale) ordered = ordered || planes.parts[scale] != nullptr;
+  const auto kernel = ordered ? bits_kernel<true> : bits_kernel<false>;
   const int bytes = kShared * int(sizeof(uint32_t));
-  cudaFuncSetAttribute(bits_kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, bytes);
-  bits_kernel<<<dim3(unsigned(parts), unsigned(planes.orientations)), kThreads, bytes, stream>>>(planes, weights,
-                                                                                                 partial);
+  const unsigned orientations = unsigned(planes.orientations);
+  cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, bytes);
+  kernel<<<dim3(unsigned(parts), orientations), kThreads, bytes, stream>>>(planes, weights, partial);
+  for (int scale = 0; scale < planes.scales; ++scale)
+    if (planes.parts[scale] != nullptr && planes.count[scale] > 0) {
+      const unsigned blocks = unsigned((planes.count[scale] + kThreads - 1) / kThreads);
+      gather_kernel<<<dim3(blocks, orientations), kThreads, 0, stream>>>(planes, scale);
+    }
 }
 
 }  // namespace sw_planes::cuda

@@ -11,7 +11,7 @@ namespace sw_planes::cuda {
 int parts_of(const Planes& planes);
 
 // weights [orientations][kParameters] -> partial [orientations][parts_of(planes)][kSums], and planes.to where it is not
-// null. Sums of `partial` are the same each time; those of planes.to are atomic.
+// null. Sums of `partial` are the same each time; those of planes.to are with planes.parts, else atomic.
 void bits(const Planes& planes, const float* weights, float* partial, cudaStream_t stream);
 
 }  // namespace sw_planes::cuda

@@ -1,9 +1,11 @@
 // Lookup in a grid of signs, and its gradient by the signs: a thread a place, or some places, and level. Four features,
-// as published, are one load and one atomic sum of sixteen bytes.
+// as published, are one load and, of floats, one atomic sum of sixteen bytes.
 #include "kernels.h"
 
 namespace sw_grid::cuda {
 namespace {
+
+using sw_sums::FloatAdder, sw_sums::WholeAdder;
 
 constexpr int kThreads = 256, kRunThreads = 64, kRun = 8;
 
@@ -43,17 +45,21 @@ __global__ void __launch_bounds__(kThreads)
     for (int k = 0; k < features; ++k) to[k] = sums[k];
 }
 
-__device__ __forceinline__ void add_four(float* to, float a, float b, float c, float d) {
-#if __CUDA_ARCH__ >= 900
-  atomicAdd(reinterpret_cast<float4*>(to), make_float4(a, b, c, d));
-#else
-  atomicAdd(to, a), atomicAdd(to + 1, b), atomicAdd(to + 2, c), atomicAdd(to + 3, d);
-#endif
+template <class Adder>
+__device__ __forceinline__ void add_four(const Adder& sums, int64_t at, const float* four) {
+#pragma unroll
+  for (int k = 0; k < 4; ++k) sums.add(at + k, four[k]);
 }
+#if __CUDA_ARCH__ >= 900
+__device__ __forceinline__ void add_four(const FloatAdder& sums, int64_t at, const float* four) {
+  atomicAdd(reinterpret_cast<float4*>(sums.to + at), make_float4(four[0], four[1], four[2], four[3]));
+}
+#endif
 
-template <int D>
+// Adder: FloatAdder from a table of floats, or WholeAdder from Sums.
+template <int D, class Adder, class Table>
 __global__ void __launch_bounds__(kThreads)
-    backward_kernel(const __grid_constant__ Signs at, const float* gradient, float* table) {
+    backward_kernel(const __grid_constant__ Signs at, const float* gradient, Table table) {
   const int64_t n = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   const int level = int(blockIdx.y), features = at.features;
   if (n >= at.count) return;
@@ -65,24 +71,26 @@ __global__ void __launch_bounds__(kThreads)
   float weights[1 << D];
   int32_t entries[1 << D];
   corners<D>(at, n, level, entries, weights);
+  const Adder to(table);
 #pragma unroll
   for (int corner = 0; corner < 1 << D; ++corner) {
     const float weight = weights[corner];
     if (weight == 0.f) continue;
-    float* entry = table + int64_t(entries[corner]) * features;
-    for (int k = 0; k < features; ++k) atomicAdd(entry + k, weight * own[k]);
+    const int64_t entry = int64_t(entries[corner]) * features;
+    for (int k = 0; k < features; ++k) to.add(entry + k, weight * own[k]);
   }
 }
 
 // The same of four features, for some places that follow one another: those in one cell share its sums, which makes
 // fewer of them wait for the same entries.
-template <int D>
+template <int D, class Adder, class Table>
 __global__ void __launch_bounds__(kRunThreads)
-    backward_fours_kernel(const __grid_constant__ Signs at, const float* gradient, float* table) {
+    backward_fours_kernel(const __grid_constant__ Signs at, const float* gradient, Table table) {
   const int64_t first = (int64_t(blockIdx.x) * kRunThreads + threadIdx.x) * kRun;
   const int64_t last = first + kRun < at.count ? first + kRun : at.count;
   const int level = int(blockIdx.y);
   constexpr int kCorners = 1 << D;
+  const Adder to(table);
   float sums[kCorners][4] = {};
   int32_t held[kCorners];
 #pragma unroll
@@ -92,7 +100,7 @@ __global__ void __launch_bounds__(kRunThreads)
     for (int corner = 0; corner < kCorners; ++corner) {
       const float* sum = sums[corner];
       if (sum[0] != 0.f || sum[1] != 0.f || sum[2] != 0.f || sum[3] != 0.f)
-        add_four(table + int64_t(held[corner]) * 4, sum[0], sum[1], sum[2], sum[3]);
+        add_four(to, int64_t(held[corner]) * 4, sum);
     }
   };
   for (int64_t n = first; n < last; ++n) {
@@ -123,6 +131,19 @@ __global__ void __launch_bounds__(kRunThreads)
 
 dim3 grid_of(const Signs& at) { return {unsigned((at.count + kThreads - 1) / kThreads), unsigned(at.levels.count)}; }
 
+template <class Adder, class Table>
+void run_backward(const Signs& at, bool four, const float* gradient, Table table, cudaStream_t stream) {
+  if (four) {
+    const int64_t runs = (at.count + kRun - 1) / kRun;
+    const dim3 blocks(unsigned((runs + kRunThreads - 1) / kRunThreads), unsigned(at.levels.count));
+    const auto kernel = at.axes == 2 ? backward_fours_kernel<2, Adder, Table> : backward_fours_kernel<3, Adder, Table>;
+    kernel<<<blocks, kRunThreads, 0, stream>>>(at, gradient, table);
+  } else {
+    const auto kernel = at.axes == 2 ? backward_kernel<2, Adder, Table> : backward_kernel<3, Adder, Table>;
+    kernel<<<grid_of(at), kThreads, 0, stream>>>(at, gradient, table);
+  }
+}
+
 }  // namespace
 
 void signs_lookup(const Signs& at, bool four, const float* table, float* found, cudaStream_t stream) {
@@ -132,15 +153,11 @@ void signs_lookup(const Signs& at, bool four, const float* table, float* found, 
 }
 
 void signs_backward(const Signs& at, bool four, const float* gradient, float* table, cudaStream_t stream) {
-  if (four) {
-    const int64_t runs = (at.count + kRun - 1) / kRun;
-    const dim3 blocks(unsigned((runs + kRunThreads - 1) / kRunThreads), unsigned(at.levels.count));
-    const auto kernel = at.axes == 2 ? backward_fours_kernel<2> : backward_fours_kernel<3>;
-    kernel<<<blocks, kRunThreads, 0, stream>>>(at, gradient, table);
-  } else {
-    const auto kernel = at.axes == 2 ? backward_kernel<2> : backward_kernel<3>;
-    kernel<<<grid_of(at), kThreads, 0, stream>>>(at, gradient, table);
-  }
+  run_backward<FloatAdder>(at, four, gradient, table, stream);
+}
+
+void signs_backward(const Signs& at, bool four, const float* gradient, const sw_sums::Sums& sums, cudaStream_t stream) {
+  run_backward<WholeAdder>(at, four, gradient, sums, stream);
 }
 
 }  // namespace sw_grid::cuda

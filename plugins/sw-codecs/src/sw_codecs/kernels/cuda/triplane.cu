@@ -1,20 +1,36 @@
 // Lookup in triplanes and its gradient: a thread takes four channels (or one) of a pair of axes.
+#include <type_traits>
+
 #include "triplane.h"
 
 namespace sw_triplane::cuda {
 namespace {
 
+using sw_sums::FloatAdder, sw_sums::WholeAdder;
+
 constexpr int kThreads = 128, kRun = 8;
 constexpr int kTile = 32, kRows = 8;
 
+struct FromFloats {
+  const float* from;
+  __device__ __forceinline__ float operator()(int64_t at) const { return from[at]; }
+};
+struct FromSums {
+  sw_sums::Sums sums;
+  __device__ __forceinline__ float operator()(int64_t at) const {
+    return sw_sums::value_of(sums.to[at], *sums.largest, sums.count);
+  }
+};
+
+template <class From>
 __global__ void __launch_bounds__(kTile* kRows)
-    transpose_kernel(const float* from, float* to, int64_t a, int64_t b, float gain) {
+    transpose_kernel(const __grid_constant__ From from, float* to, int64_t a, int64_t b, float gain) {
   __shared__ float tile[kTile][kTile + 1];
   const int64_t plane = int64_t(blockIdx.z) * a * b, column = int64_t(blockIdx.x) * kTile;
   const int64_t row = int64_t(blockIdx.y) * kTile;
   const int x = int(threadIdx.x), y = int(threadIdx.y);
   for (int i = y; i < kTile; i += kRows)
-    if (row + i < a && column + x < b) tile[i][x] = from[plane + (row + i) * b + column + x];
+    if (row + i < a && column + x < b) tile[i][x] = from(plane + (row + i) * b + column + x);
   __syncthreads();
   for (int i = y; i < kTile; i += kRows)
     if (column + i < b && row + x < a) {
@@ -40,17 +56,25 @@ __device__ __forceinline__ Some<kWidth> load(const float* from) {
   return found;
 }
 
-template <int kWidth>
-__device__ __forceinline__ void add(float* to, const Some<kWidth>& some) {
+template <int kWidth, class Adder>
+__device__ __forceinline__ void add(const Adder& sums, int64_t at, const Some<kWidth>& some) {
 #if __CUDA_ARCH__ >= 900
-  if constexpr (kWidth == 4) {
-    atomicAdd(reinterpret_cast<float4*>(to), make_float4(some.at[0], some.at[1], some.at[2], some.at[3]));
+  if constexpr (kWidth == 4 && std::is_same_v<Adder, FloatAdder>) {
+    atomicAdd(reinterpret_cast<float4*>(sums.to + at),
+              make_float4(some.at[0], some.at[1], some.at[2], some.at[3]));
   } else
 #endif
   {
 #pragma unroll
-    for (int i = 0; i < kWidth; ++i) atomicAdd(to + i, some.at[i]);
+    for (int i = 0; i < kWidth; ++i) sums.add(at + i, some.at[i]);
   }
+}
+
+__device__ __forceinline__ FloatAdder adder_of(const Tables& tables, int scale) {
+  return FloatAdder(tables.of[scale]);
+}
+__device__ __forceinline__ WholeAdder adder_of(const SumTables& tables, int scale) {
+  return WholeAdder({tables.of[scale], tables.largest, tables.count});
 }
 
 // Thread number -> what it takes: a site or run of sites, a pair, the first of its channels.
@@ -99,20 +123,21 @@ __device__ __forceinline__ bool any(const Some<kWidth>& some) {
   return found;
 }
 
-template <int kWidth>
+// To: Tables or SumTables.
+template <int kWidth, class To>
 __global__ void __launch_bounds__(kThreads)
-    backward_kernel(const __grid_constant__ Sites sites, const float* slopes, const __grid_constant__ Tables tables) {
+    backward_kernel(const __grid_constant__ Sites sites, const float* slopes, const __grid_constant__ To tables) {
   const Part part = part_of<kWidth>(sites);
   const int64_t first = part.row * kRun, last = first + kRun < sites.count ? first + kRun : sites.count;
   for (int scale = 0; scale < sites.scales; ++scale) {
-    float* const table = tables.of[scale] + part.channel;
+    const auto to = adder_of(tables, scale);
     Some<kWidth> sums[kCorners] = {};
     int32_t cells[kCorners] = {-1, -1, -1, -1};
     const auto flush = [&] {
 #pragma unroll
       for (int corner = 0; corner < kCorners; ++corner)
         if (cells[corner] >= 0 && any<kWidth>(sums[corner]))
-          add<kWidth>(table + int64_t(cells[corner]) * sites.channels, sums[corner]);
+          add<kWidth>(to, int64_t(cells[corner]) * sites.channels + part.channel, sums[corner]);
     };
     for (int64_t row = first; row < last; ++row) {
       // A plane is in the feature of its own scale and of all finer ones.
@@ -147,12 +172,31 @@ unsigned blocks_of(int64_t rows, const Sites& sites, int width) {
   return unsigned((rows * kPairs * (sites.channels / width) + kThreads - 1) / kThreads);
 }
 
+template <class From>
+void run_transpose(const From& from, float* to, int k, int64_t a, int64_t b, float gain, cudaStream_t stream) {
+  if (k == 0 || a == 0 || b == 0) return;
+  const dim3 blocks(unsigned((b + kTile - 1) / kTile), unsigned((a + kTile - 1) / kTile), unsigned(k));
+  transpose_kernel<From><<<blocks, dim3(kTile, kRows), 0, stream>>>(from, to, a, b, gain);
+}
+
+template <class To>
+void run_backward(const Sites& sites, bool four, const float* slopes, const To& tables, cudaStream_t stream) {
+  const int64_t runs = (sites.count + kRun - 1) / kRun;
+  if (runs == 0) return;
+  if (four)
+    backward_kernel<4, To><<<blocks_of(runs, sites, 4), kThreads, 0, stream>>>(sites, slopes, tables);
+  else
+    backward_kernel<1, To><<<blocks_of(runs, sites, 1), kThreads, 0, stream>>>(sites, slopes, tables);
+}
+
 }  // namespace
 
 void transpose(const float* from, float* to, int k, int64_t a, int64_t b, float gain, cudaStream_t stream) {
-  if (k == 0 || a == 0 || b == 0) return;
-  const dim3 blocks(unsigned((b + kTile - 1) / kTile), unsigned((a + kTile - 1) / kTile), unsigned(k));
-  transpose_kernel<<<blocks, dim3(kTile, kRows), 0, stream>>>(from, to, a, b, gain);
+  run_transpose(FromFloats{from}, to, k, a, b, gain, stream);
+}
+
+void transpose(const sw_sums::Sums& from, float* to, int k, int64_t a, int64_t b, cudaStream_t stream) {
+  run_transpose(FromSums{from}, to, k, a, b, 0.f, stream);
 }
 
 void lookup(const Sites& sites, bool four, const Tables& tables, float* features, cudaStream_t stream) {
@@ -164,12 +208,11 @@ void lookup(const Sites& sites, bool four, const Tables& tables, float* features
 }
 
 void backward(const Sites& sites, bool four, const float* slopes, const Tables& tables, cudaStream_t stream) {
-  const int64_t runs = (sites.count + kRun - 1) / kRun;
-  if (runs == 0) return;
-  if (four)
-    backward_kernel<4><<<blocks_of(runs, sites, 4), kThreads, 0, stream>>>(sites, slopes, tables);
-  else
-    backward_kernel<1><<<blocks_of(runs, sites, 1), kThreads, 0, stream>>>(sites, slopes, tables);
+  run_backward(sites, four, slopes, tables, stream);
+}
+
+void backward(const Sites& sites, bool four, const float* slopes, const SumTables& tables, cudaStream_t stream) {
+  run_backward(sites, four, slopes, tables, stream);
 }
 
 }  // namespace sw_triplane::cuda

@@ -1,6 +1,7 @@
-// Backward compositing of surfels: the scheme of blend_backward.cu. What the maps add to phi and to dL/d(1/z) is told
-// at the top of cpu/surfel_blend_backward.cpp.
+// Backward compositing of surfels: the scheme of blend_backward.cu, kOrdered too. What the maps add to phi and to
+// dL/d(1/z) is told at the top of cpu/surfel_blend_backward.cpp.
 #include "../blend.h"
+#include "groups.h"
 #include "surfel_stage.h"
 #include "warp_sums.h"
 
@@ -22,10 +23,21 @@ struct MapPixel {  // gradients, and what the maps make of them
 };
 
 template <bool kWithMaps>
+constexpr int kColumnsOf = kWithMaps ? int(kSurfelColumns) : int(kSurfelPlain);
+constexpr int kNoColumn = kSurfelPlain - 1;  // one between the sums is none
+
+// Sums of each warp for each surfel of a stage, where they have one order; a number more than columns, so that rows
+// start in different banks.
+template <bool kWithMaps>
+using OwnSums = float[kWarps][kThreads][kColumnsOf<kWithMaps> + 1];
+
+template <bool kWithMaps, bool kOrdered>
 __global__ void __launch_bounds__(kThreads)
     backward_kernel(View<float> view, bool tight, float clamp_limit, Splats splats, TileLists lists, SurfelImage source,
-                    ImageGradient gradient, const float* maps_gradient, float* rows) {
-  constexpr int kColumns = kWithMaps ? int(kSurfelColumns) : int(kSurfelPlain);
+                    ImageGradient gradient, const float* maps_gradient, float* rows, float* pair_sums) {
+  constexpr int kColumns = kColumnsOf<kWithMaps>;
+  extern __shared__ float own_memory[];
+  [[maybe_unused]] auto& own = *reinterpret_cast<OwnSums<kWithMaps>*>(own_memory);
   __shared__ Stage stage;
   __shared__ unsigned block_last;
 
@@ -80,7 +92,10 @@ __global__ void __launch_bounds__(kThreads)
   __syncthreads();
 
   const int index = spread_index<kColumns>(lane_index());
-  const int column = index == kSumBlue + 1 ? -1 : index;  // one between the sums is none
+  const int column = index == kNoColumn ? -1 : index;
+  if constexpr (kOrdered)
+    for (int w = 0; w < kWarps; ++w)
+      for (int i = 0; i < kColumns; ++i) own[w][threadIdx.x][i] = 0.f;
 
   for (int stop = int(block_last); stop > 0; stop -= kThreads) {  // list positions [stop - kThreads, stop)
     const int position = stop - 1 - int(threadIdx.x);
@@ -154,22 +169,66 @@ __global__ void __launch_bounds__(kThreads)
         }
         if (!any_touched) continue;
         const float total = spread_sums<kColumns>(sums);
-        if (column >= 0) atomicAdd(rows + int64_t(stage.gaussian[k]) * kColumns + column, total);
+        if constexpr (kOrdered) {
+          if (index >= 0) own[warp_index()][k][index] = total;
+        } else {
+          if (column >= 0) atomicAdd(rows + int64_t(stage.gaussian[k]) * kColumns + column, total);
+        }
       }
     }
     __syncthreads();
+    if constexpr (kOrdered) {
+      static_assert(kWarps == 4);
+      const int k = int(threadIdx.x);
+      for (int i = 0; i < kColumns; ++i) {
+        if (position >= 0)
+          pair_sums[(int64_t(begin) + position) * kColumns + i] =
+              (own[0][k][i] + own[1][k][i]) + (own[2][k][i] + own[3][k][i]);
+        for (int w = 0; w < kWarps; ++w) own[w][k][i] = 0.f;
+      }
+    }
   }
+}
+
+// Where the sums of a splat go: each has a row of its own.
+struct PutSurfel {
+  const float2* tail;
+  float* rows;
+  int columns;
+  __device__ __forceinline__ void operator()(int64_t splat, int index, float total) const {
+    if (index != kNoColumn) rows[int64_t(__float_as_int(tail[splat].y)) * columns + index] += total;
+  }
+};
+
+template <bool kWithMaps>
+void run(const View<float>& view, bool tight, float clamp_limit, const Splats& splats, const TileLists& lists,
+         const SurfelImage& image, const ImageGradient& gradient, const float* maps, float* rows,
+         const Ordered& ordered, cudaStream_t stream) {
+  constexpr int kColumns = kColumnsOf<kWithMaps>;
+  const unsigned tiles = unsigned(view.tiles_x()) * unsigned(view.tiles_y());
+  if (ordered.pair_sums == nullptr) {
+    backward_kernel<kWithMaps, false><<<tiles, kThreads, 0, stream>>>(view, tight, clamp_limit, splats, lists, image,
+                                                                      gradient, maps, rows, nullptr);
+    return;
+  }
+  // Zeros for the pairs that no block gets to.
+  cudaMemsetAsync(ordered.pair_sums, 0, size_t(ordered.pairs) * kColumns * sizeof(float), stream);
+  constexpr int kBytes = int(sizeof(OwnSums<kWithMaps>));
+  cudaFuncSetAttribute(backward_kernel<kWithMaps, true>, cudaFuncAttributeMaxDynamicSharedMemorySize, kBytes);
+  backward_kernel<kWithMaps, true><<<tiles, kThreads, kBytes, stream>>>(view, tight, clamp_limit, splats, lists, image,
+                                                                        gradient, maps, rows, ordered.pair_sums);
+  sum_groups<kColumns>(ordered.splats, ordered.pairs_of_splat, ordered.pair_sums,
+                       PutSurfel{splats.tail, rows, kColumns}, stream);
 }
 
 }  // namespace
 
 void blend_surfels_backward(const View<float>& view, const Settings& settings, const Splats& splats,
                             const TileLists& lists, const SurfelImage& image, const ImageGradient& gradient,
-                            const float* maps, float* rows, cudaStream_t stream) {
-  const unsigned tiles = unsigned(view.tiles_x()) * unsigned(view.tiles_y());
+                            const float* maps, float* rows, const Ordered& ordered, cudaStream_t stream) {
   const float clamp_limit = settings.pass_clamp ? 3e38f : float(kAlphaMax);
-  const auto kernel = maps != nullptr ? backward_kernel<true> : backward_kernel<false>;
-  kernel<<<tiles, kThreads, 0, stream>>>(view, settings.tight, clamp_limit, splats, lists, image, gradient, maps, rows);
+  const auto of_kind = maps != nullptr ? run<true> : run<false>;
+  of_kind(view, settings.tight, clamp_limit, splats, lists, image, gradient, maps, rows, ordered, stream);
 }
 
 }  // namespace sw::cuda

@@ -26,10 +26,10 @@ void visible_surfel_radii(const View<float>& view, const Gaussians<float>& g, co
                           cudaStream_t stream);
 void blend_surfels(const View<float>& view, bool tight, const Splats& splats, const TileLists& lists,
                    const SurfelImage& image, Counters* counters, cudaStream_t stream);
-// `maps`: [kMaps][H][W] or null; rows [N][surfel_columns], zeros before.
+// `maps`: [kMaps][H][W] or null; rows [N][surfel_columns], zeros before. `ordered`: pair_sums [pairs][surfel_columns].
 void blend_surfels_backward(const View<float>& view, const Settings& settings, const Splats& splats,
                             const TileLists& lists, const SurfelImage& image, const ImageGradient& gradient,
-                            const float* maps, float* rows, cudaStream_t stream);
+                            const float* maps, float* rows, const Ordered& ordered, cudaStream_t stream);
 void project_surfels_backward(const View<float>& view, const Gaussians<float>& g, const Settings& settings,
                               const uint8_t* flags, const float* rows, bool maps, const Gradients<float>& out,
                               cudaStream_t stream);
