@@ -111,7 +111,7 @@ def test_a_killed_download_goes_on(site: Site, target: Path):
         "import sys\nfrom pathlib import Path\nfrom sw_datasets.downloads.download import download\n"
         "import time\n"
         "download(sys.argv[1], Path(sys.argv[2]), on_notice=lambda text: print(text, flush=True), "
-        "pause=lambda s: time.sleep(60))\n"
+        "pause=lambda s: time.sleep(3600))\n"
     )
     site.cuts = [CUT]
     with subprocess.Popen(
