@@ -30,12 +30,12 @@ SHORT = {
     # The opacity that keeps an anchor is raised, or none of them would have gone after so few steps.
     "test-anchors": ("iterations=50", "min_opacity=0.99", "log_every=1"),
 }
-INTERRUPTED = {
-    "test-distill": (1, ("base_iterations=10", "iterations=150", "log_every=1")),
-    "test-anchors": (0, ("iterations=150", "adjust_interval=10", "grad_threshold=5e-3", "log_every=1")),
-}
-"""The stage that is interrupted, and a run long enough that the interrupt nearly always comes in the middle of a step."""
 STEPS = 150
+INTERRUPTED = {
+    "test-distill": (1, ("base_iterations=10", f"iterations={STEPS}", "log_every=1")),
+    "test-anchors": (0, (f"iterations={STEPS}", "adjust_interval=10", "grad_threshold=5e-3", "log_every=1")),
+}
+"""The stage that is interrupted, and a run so long that the interrupt nearly always comes in the middle of a step."""
 BRAKE = f"""
 import os, time
 from splatwizard_core.api import hookimpl

@@ -104,7 +104,7 @@ class Life:
             _, told = process.communicate(timeout=after)
         except subprocess.TimeoutExpired:
             os.killpg(process.pid, signal.SIGINT)
-            _, told = process.communicate(timeout=60)
+            _, told = process.communicate()
         self.log.append(told)
         return process.returncode
 

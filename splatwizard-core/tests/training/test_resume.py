@@ -459,7 +459,12 @@ def test_times_and_steps_add_up_over_processes(toy, now, tmp_path):
             now[0] += 2
             return super().render(*given)
 
-    same = {"iterations": 60, "directory": tmp_path, "rasterizer": TwoSeconds(), "ppl": PipelineParams(profile="stages")}
+    same = {
+        "iterations": 60,
+        "directory": tmp_path,
+        "rasterizer": TwoSeconds(),
+        "ppl": PipelineParams(profile="stages"),
+    }
     with pytest.raises(TrainingStopped):
         toy.train(**same, stop_after=59)
     part = json.loads((tmp_path / "00-0000059.json").read_text())["content"]["progress"]
