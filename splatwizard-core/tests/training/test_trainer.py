@@ -274,7 +274,7 @@ def test_a_step_leaves_no_graph_behind(toy):
 
 
 def timed_stage(toy, now, iterations):
-    """A stage in which, each step, the pre task takes 1 s, drawing 2 s, the loss 4, its gradient 8, the post task 16."""
+    """A stage whose pre task takes 1 s a step, drawing 2 s, the loss 4 s, its gradient 8 s, the post task 16 s."""
 
     class Timed(toy.Rasterizer):
         def render(self, *given):
