@@ -154,7 +154,7 @@ def test_completion_imports_nothing_heavy(line):
         print([m for m in ("torch", "numpy", "scipy", "pydantic", "PIL", "rich") if m in sys.modules], file=sys.stderr)
     """
     done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, timeout=60, check=False,
+        [sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, timeout=300, check=False,
         env={**os.environ, "SW_PLUGINS": ",".join(p.key for p in load_plugins().plugins if is_ours(p.distribution))},
     )  # fmt: skip
     assert done.stderr == "[]\n"
@@ -167,7 +167,7 @@ def test_the_script_of_each_shell_asks_sw(shell, capsys):
     script = capsys.readouterr().out
     assert f"{complete.VARIABLE}={shell}_complete" in script
     if shutil.which(shell):
-        done = subprocess.run([shell, "-n"], input=script, capture_output=True, text=True, timeout=30, check=False)
+        done = subprocess.run([shell, "-n"], input=script, capture_output=True, text=True, timeout=300, check=False)
         assert (done.returncode, done.stderr) == (0, "")
 
 
@@ -184,7 +184,7 @@ def test_bash_completes_a_line(tmp_path):
         echo "got ${{COMPREPLY[*]}}"
     """
     done = subprocess.run(
-        ["bash", "--norc", "-c", textwrap.dedent(lines)], capture_output=True, text=True, timeout=60, check=False,
+        ["bash", "--norc", "-c", textwrap.dedent(lines)], capture_output=True, text=True, timeout=300, check=False,
         env={**os.environ, "PATH": f"{tmp_path}{os.pathsep}{os.environ['PATH']}"}, cwd=Path(tmp_path),
     )  # fmt: skip
     assert done.stdout == "got 3dgs\n", done.stderr

@@ -43,7 +43,7 @@ def start(script: ModuleType, monkeypatch: pytest.MonkeyPatch, *arguments: objec
 def test_devices_of_a_run_take_turns_and_runs_do_not(script, runs, tmp_path, monkeypatch, capsys):
     at_work: Counter[str] = Counter()
     most = {"of one run": 0, "of all": 0}
-    guard, together = threading.Lock(), threading.Barrier(3, timeout=60)
+    guard, together = threading.Lock(), threading.Barrier(3, timeout=300)
 
     def sw(command, source, *arguments):
         if command == "decode":

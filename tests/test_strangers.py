@@ -30,11 +30,29 @@ SHORT = {
     # The opacity that keeps an anchor is raised, or none of them would have gone after so few steps.
     "test-anchors": ("iterations=50", "min_opacity=0.99", "log_every=1"),
 }
+STEPS = 150
 INTERRUPTED = {
-    "test-distill": (1, ("base_iterations=10", "iterations=150", "log_every=1")),
-    "test-anchors": (0, ("iterations=150", "adjust_interval=10", "grad_threshold=5e-3", "log_every=1")),
+    "test-distill": (1, ("base_iterations=10", f"iterations={STEPS}", "log_every=1")),
+    "test-anchors": (0, (f"iterations={STEPS}", "adjust_interval=10", "grad_threshold=5e-3", "log_every=1")),
 }
-"""The stage that is interrupted, and a run long enough that it has not ended before the interrupt arrives."""
+"""The stage that is interrupted, and a run so long that the interrupt nearly always comes in the middle of a step."""
+BRAKE = f"""
+import os, time
+from splatwizard_core.api import hookimpl
+
+class Brake:
+    def after_step(self, model, record):
+        if record.step == {STEPS} - 10:
+            time.sleep(3600)
+
+    def finished(self):
+        pass
+
+@hookimpl
+def run_started(training):
+    return Brake() if "TEST_BRAKE" in os.environ else None
+"""
+"""A plugin that stops a training shortly before its end until it is interrupted: however late that comes, it comes."""
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +62,12 @@ def strangers(tmp_path_factory: pytest.TempPathFactory, core_environment, wheels
     environment = core_environment.clone(root / "env")
     ours = (wheel for name, wheel in wheels.items() if name != "splatwizard-core")
     environment.install(*ours, *build_wheels(list(PACKAGES.values()), root))
+    (site,) = environment.prefix.glob("lib/python*/site-packages")
+    (site / "sw_brake.py").write_text(BRAKE)
+    info = site / "sw_brake-0.1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: sw-brake\nVersion: 0.1\n")
+    (info / "entry_points.txt").write_text("[splatwizard]\nbrake = sw_brake\n")
     return environment
 
 
@@ -95,17 +119,17 @@ def test_an_interrupted_training_goes_on_and_ends_as_an_uninterrupted_one(strang
     stage, sets = INTERRUPTED[method]
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     strangers.run("train", *arguments(method, whole, sets))
-    with strangers.start("train", *arguments(method, broken, sets)) as process:
+    with strangers.start("train", *arguments(method, broken, sets), TEST_BRAKE="1") as process:
         while process.poll() is None and not any(x["stage"] == stage and x["step"] > 20 for x in log_of(broken)):
             time.sleep(0.01)
         process.send_signal(signal.SIGINT)
-        _, told = process.communicate(timeout=60)
+        _, told = process.communicate()
     assert process.returncode == 130, told
     last = log_of(broken)[-1]
-    assert (last["stage"], last["step"] < 150) == (stage, True)
+    assert (last["stage"], last["step"] < STEPS) == (stage, True)
     assert list(broken.glob(f"**/checkpoints/{stage:02}-{last['step']:07}.safetensors"))
     strangers.run("train", *arguments(method, broken, sets))
-    assert log_of(broken)[-1]["step"] == 150
+    assert log_of(broken)[-1]["step"] == STEPS
     files = []
     for out in (whole, broken):
         (directory,) = (path.parent for path in out.glob("**/config.toml"))

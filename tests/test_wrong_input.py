@@ -388,7 +388,7 @@ def test_wrong_input_to_a_real_process(row: Row, things: Path, tmp_path: Path, s
     before = tree(things, tmp_path)
     done = subprocess.run(
         [sys.executable, "-m", "splatwizard_core", *shlex.split(filled(row.line, things, tmp_path))],
-        capture_output=True, text=True, timeout=120, check=False,
+        capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
     assert_told(done.stderr, done.stdout, filled(row.told, things, tmp_path))
     assert done.returncode == row.status

@@ -16,7 +16,7 @@ HOLD = """
 import sys, time
 from pathlib import Path
 from splatwizard_native.lock import build_lock
-with build_lock(Path(sys.argv[1]), timeout=5, say=print):
+with build_lock(Path(sys.argv[1]), timeout=300, say=print):
     print("held", flush=True)
     sys.stdin.read()
 """

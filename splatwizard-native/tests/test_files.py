@@ -81,7 +81,7 @@ def test_what_a_killed_process_left_goes_with_the_next_write(tmp_path: Path):
         "import os, signal, sys\nfrom splatwizard_native.files import replacing\n"
         "with replacing(sys.argv[1]) as t:\n    t.write_text('half')\n    os.kill(os.getpid(), signal.SIGKILL)\n"
     )
-    subprocess.run([sys.executable, "-c", program, str(path)], check=False, timeout=60)
+    subprocess.run([sys.executable, "-c", program, str(path)], check=False, timeout=300)
     (left,) = os.listdir(tmp_path)
     of_another = left.replace(".x.", ".y.")
     (tmp_path / of_another).write_text("half")
@@ -124,7 +124,7 @@ def test_a_scratch_folder_goes_and_takes_those_of_killed_processes_along(
         "tempfile.tempdir = sys.argv[1]\n"
         "with scratch_folder('test') as f:\n    (f / 'x').touch()\n    os.kill(os.getpid(), signal.SIGKILL)\n"
     )
-    subprocess.run([sys.executable, "-c", program, str(tmp_path)], check=False, timeout=60)
+    subprocess.run([sys.executable, "-c", program, str(tmp_path)], check=False, timeout=300)
     assert len(os.listdir(tmp_path)) == 1
     with scratch_folder("test") as folder:
         assert os.listdir(tmp_path) == [folder.name]

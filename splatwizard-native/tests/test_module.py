@@ -107,7 +107,7 @@ def test_an_unknown_march_is_refused(package):
 
 def test_importing_imports_no_torch():
     program = "import sys, splatwizard_native; sys.exit('torch' in sys.modules)"
-    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=300)
 
 
 def test_a_module_loads_once_native_code_is_switched_on_again(package, monkeypatch):

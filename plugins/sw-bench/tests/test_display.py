@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import io
 import json
-import time
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
+from sw_bench import display
 from sw_bench.cells import Cell, run_job
 from sw_bench.display import LiveTable
 from sw_bench.estimates import Estimates
@@ -23,13 +23,14 @@ def cell(root: Path, label: str, scene: str, rate: str) -> Cell:
 
 
 @pytest.fixture
-def sweep(tmp_path):
+def sweep(tmp_path, monkeypatch):
     """One run finished before, one running, one waiting, of two methods on two scenes; the fourth is no run."""
+    monkeypatch.setattr(display, "time", SimpleNamespace(monotonic=lambda: 100.0))
     cells = [cell(tmp_path, "a", "x/garden", "r1"), cell(tmp_path, "b", "x/garden", "r1"),
              cell(tmp_path, "a", "room", "r2")]  # fmt: skip
     jobs = [run_job([each]) for each in cells]
     return SimpleNamespace(
-        cells=cells, jobs=jobs, waiting=[jobs[2]], running={"t": (jobs[1], time.monotonic() - 70, 0)},
+        cells=cells, jobs=jobs, waiting=[jobs[2]], running={"t": (jobs[1], 30.0, 0)},
         executor=SimpleNamespace(slots=2),
     )  # fmt: skip
 

@@ -26,18 +26,16 @@ def python(program: str) -> list[str]:
     return [sys.executable, "-c", program]
 
 
-def ended(executor, count, seconds=60.0):
+def ended(executor, count):
     """Ends of so many processes, by ticket."""
-    found, until = [], time.monotonic() + seconds
-    while len(found) < count and time.monotonic() < until:
+    found = []
+    while len(found) < count:
         found += executor.ended(0.2)
     return {ticket: status for ticket, status, _ in found}
 
 
 def wait_for(path: Path, text: str) -> None:
-    until = time.monotonic() + 60
     while not (path.exists() and text in path.read_text()):
-        assert time.monotonic() < until, f"{path} never held {text!r}"
         time.sleep(0.02)
 
 
@@ -64,7 +62,7 @@ def test_who_waits_for_processes_does_not_look_again_and_again(tmp_path, monkeyp
     monkeypatch.setattr(time, "sleep", lambda seconds: pytest.fail("waits by sleeping"))
     assert executor.ended(0.0) == []
     executor.start("a", python(""), tmp_path / "log")
-    assert executor.ended(60.0) == [("a", 0, "")]
+    assert executor.ended(300.0) == [("a", 0, "")]
 
 
 def test_stopping_lets_processes_end_by_themselves(tmp_path, four_cores):
@@ -120,7 +118,7 @@ def test_a_process_of_a_sweep_is_sw_and_waits_for_who_holds_its_directory(tmp_pa
         assert process.poll() is None
     assert process.stdout is not None
     assert process.stdout.read().split() == [b"0.2.0"]  # its input stays open meanwhile: its owner is there
-    assert process.wait(60) == 0
+    assert process.wait() == 0
 
 
 def test_a_process_ends_with_its_owner_as_with_ctrl_c(tmp_path):
@@ -134,12 +132,12 @@ def test_a_process_ends_with_its_owner_as_with_ctrl_c(tmp_path):
         signal.signal(signal.SIGTERM, end)
         threading.Thread(target=_end_with, args=(0,), daemon=True).start()
         open({str(tmp_path / "began")!r}, "w").write("began")
-        time.sleep(60)
+        time.sleep(3600)
     """)
     owner = textwrap.dedent(f"""
         import subprocess, sys, time
         subprocess.Popen([sys.executable, "-c", {program!r}], stdin=subprocess.PIPE, start_new_session=True)
-        time.sleep(60)
+        time.sleep(3600)
     """)
     process = subprocess.Popen(python(owner), env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)})
     wait_for(tmp_path / "began", "began")
@@ -204,7 +202,7 @@ def test_a_job_whose_time_is_up_ends_its_process_and_goes_back_into_the_queue(tm
     running.start()
     wait_for(tmp_path / "log", "began")
     again = work.checkpoint()
-    running.join(30)
+    running.join()
     assert (tmp_path / "log").read_text() == "began\ntold to end\n"
     assert isinstance(again, submitit.helpers.DelayedSubmission)
     assert again.function == Work(work.command, work.log)
@@ -217,7 +215,7 @@ def test_a_signal_that_comes_while_a_job_waits_lets_its_process_end_at_once(tmp_
 
     from sw_bench import slurm as module
 
-    monkeypatch.setattr(module, "PATIENCE_SECONDS", 5.0)
+    monkeypatch.setattr(module, "PATIENCE_SECONDS", 300.0)
     work, after = module.Work(python(WAITS), str(tmp_path / "log")), []
 
     def take_checkpoint(*_):

@@ -9,7 +9,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections import namedtuple
 from collections.abc import Iterator
 from pathlib import Path
@@ -112,7 +111,7 @@ def test_a_killed_download_goes_on(site: Site, target: Path):
         "import sys\nfrom pathlib import Path\nfrom sw_datasets.downloads.download import download\n"
         "import time\n"
         "download(sys.argv[1], Path(sys.argv[2]), on_notice=lambda text: print(text, flush=True), "
-        "pause=lambda s: time.sleep(60))\n"
+        "pause=lambda s: time.sleep(3600))\n"
     )
     site.cuts = [CUT]
     with subprocess.Popen(
@@ -299,10 +298,8 @@ def test_an_interrupted_download_keeps_what_came(site: Site, target: Path):
     with pytest.raises(KeyboardInterrupt):
         download(site.url(PATH), target, pause=interrupt)
     assert target.with_name("scenes.zip.part").stat().st_size == CUT
-    begun = time.monotonic()
-    download(site.url(PATH), target, sha256=SHA256)
+    download(site.url(PATH), target, sha256=SHA256, pause=interrupt)  # which goes on at once
     assert starts(site) == [0, CUT]
-    assert time.monotonic() - begun < 30
 
 
 def test_an_answer_without_length_ends_at_the_size_of_the_registry(site: Site, target: Path):

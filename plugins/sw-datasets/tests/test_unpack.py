@@ -267,7 +267,11 @@ def test_a_full_disk_half_way_leaves_nothing(tmp_path: Path, monkeypatch: pytest
 
 
 @pytest.mark.parametrize("kind", ["zip", "tar.gz"])
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=60,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
 @given(data=st.data())
 def test_damage_is_a_fetch_error_and_writes_nothing_outside(kind: str, data: st.DataObject, tmp_path: Path):
     work = tmp_path / "work"

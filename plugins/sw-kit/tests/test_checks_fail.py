@@ -66,7 +66,8 @@ def register_methods(registry):
 @pytest.mark.parametrize(
     ("line", "said"),
     [("import torch", "imports torch"), ("print('hello')", "prints 'hello'"), ("1 / 0", "ZeroDivisionError"),
-     ("import time; t = time.process_time()\n    while time.process_time() < t + 0.02: pass", "ms of CPU")],
+     ("for _ in range(30_000):\n        pass", r"executes 6\d,\d{3} lines of Python, at most 50,000"),
+     ("import numpy", "lines of Python")],
 )  # fmt: skip
 def test_registration_that_is_not_light(installed, line, said):
     with pytest.raises(BrokenContractError, match=said):

@@ -21,7 +21,7 @@ SW = f"{shlex.quote(sys.executable)} -m splatwizard_core"
 def in_shell(line: str) -> subprocess.CompletedProcess[str]:
     """A line of bash, with the status of the first command of a pipe."""
     return subprocess.run(
-        ["bash", "-c", f"set -o pipefail; {line}"], capture_output=True, text=True, timeout=120, check=False
+        ["bash", "-c", f"set -o pipefail; {line}"], capture_output=True, text=True, timeout=300, check=False
     )
 
 

@@ -54,6 +54,7 @@ class SleepingRenderer:
         return torch.zeros(3, 1, 1)
 
 
+@pytest.mark.slow
 def test_the_clock_goes_on_while_a_frame_waits():
     """As it does for a GPU; a clock of the process's own work would tell thousands of frames per second."""
     report = measure_speed(SleepingRenderer(), [0], "cpu")

@@ -27,7 +27,7 @@ HOLD = """
     from splatwizard_core.runs.lock import directory_lock
     with directory_lock(Path(sys.argv[1])):
         print("held", flush=True)
-        time.sleep(60)
+        time.sleep(3600)
 """
 
 

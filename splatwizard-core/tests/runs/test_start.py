@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -269,17 +270,26 @@ def sw(arguments: list[str], **options: object) -> "subprocess.Popen[str]":
 
 @pytest.mark.parametrize("first", ["toy-student", "toy"])
 def test_two_processes_that_want_the_same_scene_train_it_once(toy_plugins, tmp_path, first):
-    """The second comes while the first trains it: to start from it, or as a run of its own."""
+    """The second comes while the first trains it: to start from it, or as a run of its own.
+
+    The first is stopped in the middle until the second has found it at work.
+    """
     steps = ["--set", "pretrained.iterations=400"] if first != "toy" else ["--set", "iterations=400"]
     out = ["--scene", "demo:tiny", "--out", str(tmp_path)]
     one = sw(["train", "--method", first, *out, *steps])
-    deadline = time.monotonic() + 60
     while not list(tmp_path.rglob("log.jsonl")):
-        assert time.monotonic() < deadline, one.communicate()
         assert one.poll() is None, one.communicate()
-        time.sleep(0.05)
+        time.sleep(0.01)
+    one.send_signal(signal.SIGSTOP)
     two = sw(["train", "--method", "toy-taught", *out, "--set", "pretrained.iterations=400"])
-    told = [process.communicate(timeout=120)[1] for process in (one, two)]
+    assert two.stderr is not None
+    lines: list[str] = []
+    while not any("is being written by process" in line for line in lines):
+        lines.append(two.stderr.readline())
+        assert lines[-1] != "", lines
+    one.send_signal(signal.SIGCONT)
+    told = [one.communicate()[1], "".join(lines) + two.stderr.read()]
+    two.wait()
     assert (one.returncode, two.returncode) == (0, 0), told
     assert sum(text.count("training toy on ") for text in told) == 1
     assert f"is being written by process {one.pid}" in told[1]

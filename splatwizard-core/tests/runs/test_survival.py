@@ -64,10 +64,11 @@ READER = """
         "config.toml": read_config_file, "scene.swz": ContainerReader.open, "checkpoints/*.json": read_checkpoint,
         "renders/*.png": picture,
     }
-    counts = dict.fromkeys(READ, 0)
-    directory, stop = Path(sys.argv[1]), Path(sys.argv[2])
-    while not stop.exists():
-        time.sleep(0.01)
+    looks, counts = 0, dict.fromkeys(READ, 0)
+    directory, stop, last = Path(sys.argv[1]), Path(sys.argv[2]), False
+    print("looks", flush=True)
+    while not last:
+        looks, last = looks + 1, stop.exists()  # once more after the end, when everything is there
         for pattern, read in READ.items():
             for path in directory.glob(pattern):
                 try:
@@ -77,8 +78,8 @@ READER = """
                     # A checkpoint, or anything of a run that starts again, may be gone by now; half of one may not be.
                     if path.exists() and "is missing" not in str(error):
                         sys.exit(f"{path}: {type(error).__name__}: {error}")
-        time.sleep(0.002)
-    print(json.dumps(counts))
+        time.sleep(0.01)
+    print(json.dumps({"looks": looks, **counts}))
 """
 
 
@@ -103,7 +104,7 @@ class Life:
             _, told = process.communicate(timeout=after)
         except subprocess.TimeoutExpired:
             os.killpg(process.pid, signal.SIGINT)
-            _, told = process.communicate(timeout=60)
+            _, told = process.communicate()
         self.log.append(told)
         return process.returncode
 
@@ -199,6 +200,8 @@ def reader(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
         [sys.executable, "-c", textwrap.dedent(READER), str(directory), str(tmp_path / "stop")],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
+    assert process.stdout is not None
+    assert process.stdout.readline() == "looks\n"
     yield process
     process.kill()
     process.communicate()
@@ -222,9 +225,10 @@ def test_four_deaths_in_one_run_change_nothing_and_no_reader_sees_half_a_file(
         assert life.live(death) == -signal.SIGKILL, (death, life.log[-1])
     assert life.live() == 0, life.log[-1]
     (tmp_path / "stop").touch()
-    counts, told = reader.communicate(timeout=60)
+    counts, told = reader.communicate()
     assert reader.returncode == 0, told
     assert all(json.loads(counts).values()), counts
+    assert json.loads(counts)["looks"] > len(deaths), counts
     assert life.left() == []
     assert outcome(life.directory) == undisturbed.outcome
     # Told what happened before, and by whom.

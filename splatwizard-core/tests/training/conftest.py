@@ -17,6 +17,7 @@ from splatwizard_core.rendering.info import RasterizerInfo
 from splatwizard_core.rendering.rasterizer import GradBuffer, RasterOptions, RenderResult
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
+from splatwizard_core.training import timing
 from splatwizard_core.training.losses import LossPack
 from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
 from splatwizard_core.training.params import OptimizationParams, PipelineParams
@@ -159,6 +160,14 @@ def one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
+
+
+@pytest.fixture
+def now(monkeypatch):
+    """The clock of a training, `now[0]` in seconds: it stands still until a test moves it."""
+    now = [0.0]
+    monkeypatch.setattr(timing, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    return now
 
 
 @pytest.fixture

@@ -453,14 +453,26 @@ def test_a_run_without_a_directory_writes_nothing(toy, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_times_and_steps_add_up_over_processes(toy, tmp_path):
+def test_times_and_steps_add_up_over_processes(toy, now, tmp_path):
+    class TwoSeconds(toy.Rasterizer):
+        def render(self, *given):
+            now[0] += 2
+            return super().render(*given)
+
+    same = {
+        "iterations": 60,
+        "directory": tmp_path,
+        "rasterizer": TwoSeconds(),
+        "ppl": PipelineParams(profile="stages"),
+    }
     with pytest.raises(TrainingStopped):
-        toy.train(iterations=60, directory=tmp_path, stop_after=59, ppl=PipelineParams(profile="stages"))
+        toy.train(**same, stop_after=59)
     part = json.loads((tmp_path / "00-0000059.json").read_text())["content"]["progress"]
-    outcome = toy.train(iterations=60, directory=tmp_path, ppl=PipelineParams(profile="stages"))
+    now[0] = 0.0  # another process, another clock
+    outcome = toy.train(**same)
     assert part["stage_steps"] == {"toy": 59}
-    assert outcome.train_s > part["stage_seconds"]["toy"] > 0
-    assert outcome.breakdown["toy"]["render"] > part["breakdown"]["toy"]["render"] > 0
+    assert (part["stage_seconds"]["toy"], outcome.train_s) == (118, 120)
+    assert (part["breakdown"]["toy"]["render"], outcome.breakdown["toy"]["render"]) == (118, 120)
     assert outcome.steps == 60
     assert outcome.peak_memory >= part["peak_memory"] >= 0
 

@@ -16,7 +16,7 @@ from sw_doctor import child
 from sw_doctor.text import one_line
 
 IMPORTS = "sw_doctor.imports"
-SECONDS = 60.0  # for all imports together; a package that hangs is cut off
+SECONDS = 180.0  # for all imports together; a package that hangs is cut off
 # The probe imports it, with everything that depends on it: a second process would pay for it again.
 HEAVY = ("torch", "torchvision", "lpips", "torchmetrics")
 

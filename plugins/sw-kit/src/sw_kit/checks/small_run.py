@@ -33,7 +33,7 @@ STEPS = 40
 HOSTILE = 100
 """Number of damaged files that the decoder is shown, unless they take longer than `ENOUGH_S`."""
 ENOUGH_S = 12
-HOSTILE_S = 120
+HOSTILE_S = 600
 
 
 def check_small_run(entry: Entry, plugins: PluginManager, settings: Sequence[str] = ()) -> str:
