@@ -108,12 +108,6 @@ def test_post_processing_shares_its_training():
     assert r5.training_hash() == r7.training_hash()
 
 
-def test_small_pictures_are_off_and_trainings_of_before_they_could_be_on_are_found():
-    plain, small = (resolve(Compact3DGS, "paper", sets=sets).config for sets in ({}, {"pictures.schedule": "dash"}))
-    assert "pictures" not in plain.identity()
-    assert small.identity()["pictures"]["schedule"] == "dash"
-
-
 def test_every_preset_ends_in_the_last_phase():
     for preset in Compact3DGS.PRESETS:
         config = resolve(Compact3DGS, preset).config

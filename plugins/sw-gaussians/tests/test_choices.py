@@ -10,6 +10,7 @@ from sw_gaussians.choices import Choice, Choosing, CodecChoice, Moved, OwnCodec,
 from splatwizard_core.errors import ConfigError, PluginError
 from splatwizard_core.plugins.registry import Coders, Registry
 from splatwizard_core.runs.config import apply_overrides
+from splatwizard_core.training.identity import given_values
 from splatwizard_core.training.params import Params
 
 
@@ -234,18 +235,15 @@ def test_an_older_key_that_never_was_is_unknown(config):
         config({"vq.bit": 3})
 
 
-def test_what_identifies_a_training_is_spelt_as_in_the_release_that_began(config):
-    plain = config(codec="theirs", prune__pruner="theirs", own__settings__bits=4).identity()
-    assert plain["codec"] == "theirs"
-    assert plain["prune"] == {"pruner": "theirs", "share": 0.5, "exponent": 1.0}
-    assert plain["vq"] == {"bits": 4}
-    assert "own" not in plain or plain["own"] == {}
+def test_settings_that_are_the_defaults_of_a_provider_identify_nothing(config, plugins):
+    assert given_values(config(), plugins) == {}
+    assert given_values(config(prune__settings__word="x"), plugins)["prune"] == {"settings": {"word": "x"}}
 
 
-def test_what_the_older_release_could_not_say_is_told_apart(config):
+def test_what_identifies_a_training_tells_every_choice_apart(config, plugins):
     made = [
         config(), config(codec__settings__power="2"), config(codec="theirs"), config(prune__settings__word="x"),
         config(parts__low__power="0.1"), config(parts__high__power="0.1"), config(own__settings__bits="1"),
     ]  # fmt: skip
-    contents = [str(each.identity()) for each in made]
+    contents = [str(given_values(each, plugins)) for each in made]
     assert len(set(contents)) == len(contents)

@@ -8,7 +8,6 @@ from sw_gaussians.native import GAUSSIANS
 from sw_gaussians.surface_losses import (
     add_surface_losses,
     distortion_loss,
-    identity_before_terms,
     maps_for,
     normal_disagreement,
 )
@@ -149,13 +148,6 @@ def test_weighted_terms_are_added_and_named_without_their_weight(rasterizer):
     assert float(found.parts["normals"]) == pytest.approx(float(disagreement[0, 3, 5]) / (12 * 16))
     assert float(found.total) == pytest.approx(1 + 100 * float(distortion) + 0.5 * float(found.parts["normals"]))
     assert add_surface_losses(before, result, camera(), 0.5).parts.keys() == {"l1"}
-
-
-def test_the_key_of_the_term_changes_no_identity_where_it_says_what_was_done_before():
-    content = {"surface": {"normal_term": "code", "lambda_normal": 0.05}}
-    assert identity_before_terms(content) == {"surface": {"lambda_normal": 0.05}}
-    content = {"surface": {"normal_term": "paper"}}
-    assert identity_before_terms(content) == content
 
 
 @pytest.mark.cuda

@@ -237,9 +237,3 @@ def test_from_scratch_it_trains_and_trims(plugins, toy, rasterizer):
     assert ["normals" in each for each in parts] == [False] * 4 + [True] * 4
     assert {"scale_split", "trimmed", "cloned"} <= seen
     assert model.surface == Surface(0.0, 100.0, 0.05)
-
-
-def test_configurations_from_before_the_normal_term_keep_their_identity(plugins):
-    for cls in (Trim2DGS, Trim2DGSScratch):
-        assert "normal_term" not in preset(plugins, cls, "paper").config.identity()["surface"]
-        assert preset(plugins, cls, "quick").config.identity()["surface"]["normal_term"] == "paper"

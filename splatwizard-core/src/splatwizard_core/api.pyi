@@ -51,6 +51,7 @@ from splatwizard_core.scene.scene import Protocol as Protocol
 from splatwizard_core.scene.scene import Scene as Scene
 from splatwizard_core.scene.scene import View as View
 from splatwizard_core.streams import stream as stream
+from splatwizard_core.training.identity import given_values as given_values
 from splatwizard_core.training.losses import LossPack as LossPack
 from splatwizard_core.training.losses import photometric_loss as photometric_loss
 from splatwizard_core.training.optimizer import ParamGroup as ParamGroup
@@ -60,6 +61,7 @@ from splatwizard_core.training.params import InputFile as InputFile
 from splatwizard_core.training.params import OptimizationParams as OptimizationParams
 from splatwizard_core.training.params import Params as Params
 from splatwizard_core.training.params import PipelineParams as PipelineParams
+from splatwizard_core.training.params import SameResult as SameResult
 from splatwizard_core.training.plan import When as When
 from splatwizard_core.training.pruner import Pruner as Pruner
 from splatwizard_core.training.scheduler import Scheduler as Scheduler

@@ -17,6 +17,7 @@ MODULES = {
     "runs.observers": "FinishedRun FinishedRuns StartedTraining TrainingObserver",
     "runs.lock": "directory_lock",
     "runs.config": "ResolvedConfig resolve",
+    "runs.identity": "recorded_hash",
     "runs.directory": "OWN_FILES RunRequest run_directory",
     "runs.pretrained": "base_config first_scene make_method named_scenes useful_starts",
     "runs.training": "cached_directory",

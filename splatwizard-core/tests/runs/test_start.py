@@ -18,8 +18,9 @@ from splatwizard_core.errors import CheckpointError, ConfigError, SplatwizardErr
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.runs.config import ResolvedConfig, parse_set, resolve
 from splatwizard_core.runs.directory import RunRequest
+from splatwizard_core.runs.identity import training_key
 from splatwizard_core.runs.lock import directory_lock
-from splatwizard_core.runs.pretrained import check_model, checked_start, training_key
+from splatwizard_core.runs.pretrained import check_model, checked_start
 from splatwizard_core.runs.record import Record, missing_reasons
 from splatwizard_core.runs.run import run, train_only
 from splatwizard_core.runs.session import Session

@@ -1,12 +1,10 @@
 """Hyper-parameters of 2DGS, by default those of the authors' code; what it chooses by data set is unset here."""
 
-from typing import Any
-
 from pydantic import Field
 from sw_gaussians.choices import Choosing, CodecChoice
 from sw_gaussians.config import Densify, GaussianTraining
 from sw_gaussians.start import Rotation
-from sw_gaussians.surface_losses import NormalTerm, identity_before_terms
+from sw_gaussians.surface_losses import NormalTerm
 
 from splatwizard_core.api import InputFile, Params
 
@@ -50,6 +48,3 @@ class TwoDGSConfig(Choosing, GaussianTraining):
     )
     surface: SurfaceTraining = Field(SurfaceTraining(), description="losses of the surface")
     codec: CodecChoice = Field(CodecChoice(name="gaussians-exact"), description="what writes the file")
-
-    def identity(self) -> dict[str, Any]:
-        return identity_before_terms(super().identity())

@@ -38,13 +38,3 @@ class ThreeDGSConfig(Choosing, GaussianTraining):
             mode = values.pop("codec.mode")
             values["codec.name"] = MODES.get(mode, f"gaussians-{mode}")
         return values
-
-    def identity(self) -> dict[str, Any]:
-        content = super().identity()
-        if not self.fused_updates:
-            del content["fused_updates"]  # trainings of before it existed are still found
-        mode = next((mode for mode, name in MODES.items() if name == self.codec.name), None)
-        if mode is not None:
-            content["codec"]["mode"] = mode
-            del content["codec"]["name"]
-        return content

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar
 
 from pydantic import Field
 from sw_gaussians.pictures import Pictures
 
-from splatwizard_core.api import OptimizationParams, Params
+from splatwizard_core.api import OptimizationParams, Params, SameResult
 
 
 class AnchorLearningRates(Params):
@@ -57,6 +58,10 @@ class AnchorGrowth(Params):
         """Whether cells of all levels are whole voxels, so that `subvoxel` changes nothing."""
         return all(self.init_factor % self.hierarchy**level == 0 for level in range(self.levels))
 
+    def normal(self, plugins: Any) -> AnchorGrowth:
+        found = super().normal(plugins)
+        return found.model_copy(update={"subvoxel": False}) if self.whole_voxels else found
+
 
 class AnchorLoss(Params):
     """Distortion and regularisers of the loss."""
@@ -77,28 +82,13 @@ class AnchorParams(OptimizationParams):
     loss: AnchorLoss = Field(AnchorLoss(), description="distortion and regularisers")
     pictures: Pictures = Field(Pictures(), description="sizes of the training pictures")
 
-    def identity(self) -> dict[str, Any]:
-        """Return all values but those of `pictures` where it is off: trainings of before it existed are found."""
-        return self.pictures.identity_in(super().identity())
-
 
 class CodedAnchorParams(AnchorParams):
     """Hyper-parameters of a method whose anchors have masks and a rate, to be subclassed."""
 
+    ABSENT: ClassVar[Mapping[str, Any]] = {"growth.subvoxel": True}
+
     lr: CodedAnchorLearningRates = Field(CodedAnchorLearningRates(), description="step sizes")
-    graphs: bool = Field(True, description="on a GPU, start the decoding of a step as a CUDA graph")
-
-    def identity(self) -> dict[str, Any]:
-        """Return all values but `graphs`, which says how and not what is computed.
-
-        `growth.subvoxel` is there only where it says something else than releases of before the key, which had cells
-        of fractions of a voxel: runs and trained scenes of then stay what they are. `rate_term.scale_floor`, of
-        the methods that have it, is there only where it is on.
-        """
-        content = super().identity()
-        del content["graphs"]
-        if self.growth.subvoxel or self.growth.whole_voxels:
-            del content["growth"]["subvoxel"]
-        if not content.get("rate_term", {}).get("scale_floor", True):
-            del content["rate_term"]["scale_floor"]
-        return content
+    graphs: Annotated[bool, SameResult()] = Field(
+        True, description="on a GPU, start the decoding of a step as a CUDA graph"
+    )

@@ -8,7 +8,17 @@ from pathlib import Path
 from typing import Any
 
 from splatwizard_core.api import UserInputError
-from splatwizard_core.tooling import FILE_NAME, OWN_FILES, Choices, PluginManager, Record, directory_lock, read_record
+from splatwizard_core.tooling import (
+    FILE_NAME,
+    OWN_FILES,
+    Choices,
+    PluginManager,
+    Record,
+    directory_lock,
+    load_plugins,
+    read_record,
+    recorded_hash,
+)
 from splatwizard_native import remove_folder
 from sw_bench.cells import TRAINED, Cell, SharedTraining, training_key
 
@@ -89,7 +99,7 @@ def _clear(directory: Path) -> None:
 
 
 def record_of(cell: Cell) -> Record | None:
-    """Return the record of a run if it was made with the values that the plan gives it now."""
+    """Return the record of a run, of any release, if it was made with the values that the plan gives it now."""
     path = cell.directory / FILE_NAME
     if not path.exists():
         return None
@@ -97,7 +107,8 @@ def record_of(cell: Cell) -> Record | None:
         record = read_record(path)
     except UserInputError:
         return None
-    return record if record.config_hash == cell.resolved.config_hash() else None
+    asked = cell.resolved.config_hash()
+    return record if asked in (record.config_hash, recorded_hash(load_plugins(), record)) else None
 
 
 def stamp_of(cell: Cell) -> tuple[int, int] | None:

@@ -77,9 +77,6 @@ class Steps(Params):
 
 
 _SHARED = {"training": "ema", "size": 8192, "iterations": 1_000, "batch": 80_000}
-_SIGNIFICANCE = {"kind": "v_important_score", "volume_norm": "unclamped", "use_transmittance": True}
-_VQ = {"ratio": 0.6, "rows_per_code": 4.0, "decay": 0.8, "reseed": 10}
-"""Settings of `lightgaussian` and of `importance-vq` that 0.1 did not offer here."""
 
 
 class ChimeraConfig(Choosing):
@@ -115,12 +112,3 @@ class ChimeraConfig(Choosing):
         if values.pop("vq.preset", "own") == "toolkit":
             values["vq.training"] = "official"
         return values
-
-    def identity(self) -> dict[str, Any]:
-        content = super().identity()
-        if content["score"].get("settings") == _SIGNIFICANCE:
-            del content["score"]["settings"]
-        if content["codec"] == {"settings": _VQ, "sh2": {}, "sh3": {}}:
-            del content["codec"]
-            content["vq"]["preset"] = "own"
-        return content

@@ -1,6 +1,6 @@
 """Hyper-parameters of Compact3DGS. Defaults are those of the authors' code for real scenes."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 from sw_gaussians.choices import Choosing, OwnCodec
@@ -108,7 +108,3 @@ class Compact3DGSConfig(Choosing, OptimizationParams):
             densify=self.densify,
             loss=self.loss,
         )
-
-    def identity(self) -> dict[str, Any]:
-        """Return all values but those of `pictures` where it is off: trainings of before it existed are found."""
-        return self.pictures.identity_in(super().identity())

@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 from pydantic import BaseModel, Field, ValidationError, create_model, model_validator
 
-from splatwizard_core.api import ConfigError, OptimizationParams, Params, PluginError, apply_overrides
+from splatwizard_core.api import ConfigError, OptimizationParams, Params, PluginError, apply_overrides, given_values
 
 if TYPE_CHECKING:
     from splatwizard_core.api import GaussianCodec, PluginManager, Pruner
 
+ChoiceT = TypeVar("ChoiceT", bound="Choice")
 ChoosingT = TypeVar("ChoosingT", bound="Choosing")
 
 
@@ -120,6 +121,12 @@ class Choice(Named):
             found[field] = {k: v for k, v in checked.items() if field == "settings" or k in getattr(self, field)}
         return found
 
+    def normal(self: ChoiceT, plugins: PluginManager) -> ChoiceT:
+        """Return this with those settings alone that differ from the provider's defaults."""
+        model = self._model(plugins, self.NAME)
+        settings = {} if model is None else given_values(model.model_validate(self.model_dump()["settings"]), plugins)
+        return super().normal(plugins).model_copy(update={"settings": settings})
+
 
 class CodecChoice(Choice):
     """Codec of whole Gaussian models; the default of `name` is the method's to say."""
@@ -172,8 +179,8 @@ class Moved(NamedTuple):
 class Choosing(OptimizationParams):
     """Base of configs with exchangeable parts.
 
-    OLDER       key of an older release -> where it stands now: config files and run directories with it are read as
-                before, and finished trainings are known by it. "codec" stands there for a codec that was a name alone
+    OLDER       key of an older release -> where it stands now: config files, run directories and checkpoints with it
+                are read as before. "codec" stands there for a codec that was a name alone
     """
 
     OLDER: ClassVar[Mapping[str, Moved]] = {}
@@ -222,33 +229,6 @@ class Choosing(OptimizationParams):
                 content[path] |= block.completed(plugins, path, sources)
         return type(self).model_validate(content)
 
-    def identity(self) -> dict[str, Any]:
-        """Return all values as `OLDER` has them, where the older release could say the same."""
-        content = super().identity()
-        named = dict(_blocks(self))
-        for old, moved in self.OLDER.items():
-            if old in named:
-                continue
-            held = [_taken(content, key) for key in moved.keys]
-            values = [value for value in held if value is not _MISSING] or [moved.default]
-            if all(value == values[0] for value in values):
-                _put(content, old, values[0])
-            else:
-                for key, value in zip(moved.keys, held, strict=True):
-                    if value is not _MISSING:
-                        _put(content, key, value)
-        for path, block in named.items() if self.OLDER else ():
-            if content[path].get("settings") == {}:
-                del content[path]["settings"]
-                if isinstance(block, OwnCodec):
-                    del content[path][block.NAME]
-            if path in self.OLDER and len(content[path]) == 1:
-                (content[path],) = content[path].values()
-        return content
-
-
-_MISSING = object()
-
 
 def _blocks(config: BaseModel) -> Iterator[tuple[str, Named]]:
     """Yield key and value of each block with a name."""
@@ -256,21 +236,6 @@ def _blocks(config: BaseModel) -> Iterator[tuple[str, Named]]:
         block = getattr(config, name)
         if isinstance(block, Named):
             yield name, block
-
-
-def _taken(content: dict[str, Any], key: str) -> Any:
-    """Take the value at a dotted key out of nested dicts; _MISSING if it is not there."""
-    *path, last = key.split(".")
-    for part in path:
-        content = content.get(part, {})
-    return content.pop(last, _MISSING)
-
-
-def _put(content: dict[str, Any], key: str, value: Any) -> None:
-    *path, last = key.split(".")
-    for part in path:
-        content = content.setdefault(part, {})
-    content[last] = value
 
 
 def _checked(model: type[BaseModel], path: str, given: Mapping[str, Any], sources: Mapping[str, str]) -> dict[str, Any]:

@@ -1,11 +1,11 @@
 """Hyper-parameters of training explicit Gaussians. Defaults are those of the Splatwizard paper."""
 
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from splatwizard_core.api import OptimizationParams, Params, apply_overrides
+from splatwizard_core.api import OptimizationParams, Params, SameResult, apply_overrides
 from sw_gaussians.fast import rate_factors
 
 FUSED_FROM = 200_000
@@ -109,7 +109,7 @@ class Fast(Params):
     resolution_hold: bool = Field(
         False, description="with dash, lr.position_init until the last level of half size or less, as published"
     )
-    rates: Literal["given", "length"] = Field(
+    rates: Annotated[Literal["given", "length"], SameResult()] = Field(
         "given", description="length: lr.position_final and lr.sh_rest, unless given, are raised by how short a run is"
     )
     veto_views: int = Field(
@@ -143,8 +143,6 @@ class Fast(Params):
 
 LATE = ("late_prune", "late_views", "settle", "average")
 """Keys of `Fast` that act after density control."""
-LATER = ("resolution_hold", "veto_views", "veto_pixels", *LATE)
-"""Keys of `Fast` that came after others: while they are off, trainings of before them have the same identity."""
 
 
 class Loss(Params):
@@ -178,17 +176,3 @@ class GaussianTraining(OptimizationParams):
         whole = {"lr.position_final": lr.position_final, "lr.sh_rest": lr.sh_rest}
         rates = {key: factors[key] * rate for key, rate in whole.items() if key not in sources}
         return apply_overrides(asked, rates, source="fast.rates")
-
-    def identity(self) -> dict[str, Any]:
-        """Return all values but `fast.rates`, which says where others come from, and those of `fast` that are off.
-
-        Trainings of before these existed are still found.
-        """
-        content = super().identity()
-        del content["fast"]["rates"]
-        for name in LATER:
-            if getattr(self.fast, name) == Fast.model_fields[name].default:
-                del content["fast"][name]
-        if self.fast.model_copy(update={"rates": "given"}) == Fast():
-            del content["fast"]
-        return content

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
@@ -36,14 +36,6 @@ class Pictures(Params):
                 f"pictures.until is {self.until}, and the plan ends at {steps}: pictures never become whole, lower it",
                 key="pictures.until",
             )
-
-    def identity_in(self, content: dict[str, Any]) -> dict[str, Any]:
-        """Return the identity of a method without what is off here: trainings of before these keys are found."""
-        if self == Pictures():
-            del content["pictures"]
-        elif not self.until:
-            del content["pictures"]["until"]
-        return content
 
     def sampler(
         self, inner: CameraSampler, scene: Scene, stage: Stage, *, growth: Sequence[int], growth_stop: int, every: int

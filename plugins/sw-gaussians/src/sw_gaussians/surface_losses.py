@@ -19,16 +19,6 @@ NormalTerm = Literal["code", "paper"]
 """Form of the normal loss, see `normal_disagreement`."""
 
 
-def identity_before_terms(content: dict[str, Any]) -> dict[str, Any]:
-    """Return a configuration's identity without `surface.normal_term` where that is the code's.
-
-    Runs and trained scenes of before the key existed stay what they are.
-    """
-    if content["surface"]["normal_term"] == "code":
-        del content["surface"]["normal_term"]
-    return content
-
-
 def maps_for(*, distortion: bool, normals: bool, depth_ratio: float) -> dict[str, Any]:
     """Return the fields of RasterOptions whose maps the losses of this module read.
 

@@ -1,6 +1,7 @@
 """Hyper-parameters of HAC++. Defaults are those of the authors' experiments on Mip-NeRF 360."""
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 from sw_anchors.grid_params import GridAnchorParams, GridFileSettings, GridLearningRates, Phases, RateTerm
@@ -66,6 +67,8 @@ class Codec(OwnCodec):
 
 class HACPlusConfig(Choosing, GridAnchorParams):
     """Everything that can be set for HAC++."""
+
+    ABSENT: ClassVar[Mapping[str, Any]] = {}
 
     bound_margin: Literal["hac", "extent", "none"] = Field(
         "hac", description="room around the anchors in the box of the hash grid; hac: as published; extent: 10 %"

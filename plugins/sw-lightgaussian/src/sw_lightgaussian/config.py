@@ -1,7 +1,7 @@
 """Hyper-parameters of LightGaussian. Defaults: the authors' scripts, which is what the paper's figures belong to."""
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 from sw_finetuning.distillation import DistillLoss
@@ -103,9 +103,3 @@ class LightGaussianConfig(Choosing):
     prune: Prune = Field(Prune(), description="stage 1")
     distill: Distill = Field(Distill(), description="stage 2")
     codec: CodecChoice = Field(CodecChoice(name="vectree"), description="what writes the file")
-
-    def identity(self) -> dict[str, Any]:
-        content = super().identity()
-        if content["score"]["pruner"] == "lightgaussian":  # 0.1 knew no other
-            del content["score"]["pruner"]
-        return content

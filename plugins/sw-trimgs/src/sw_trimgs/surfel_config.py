@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 from pydantic import Field
 from sw_gaussians.choices import Choosing, CodecChoice
-from sw_gaussians.surface_losses import NormalTerm, identity_before_terms
+from sw_gaussians.surface_losses import NormalTerm
 
 from splatwizard_core.api import Params
 from sw_trimgs.config import Densify, Trimming, TuneConfig
@@ -41,9 +41,6 @@ class Trim2DGSConfig(TuneConfig):
     drop_masked: bool = Field(
         False, description="first drop what lies outside the mask of a view that it is seen in (DTU)"
     )
-
-    def identity(self) -> dict[str, Any]:
-        return identity_before_terms(super().identity())
 
 
 class ScratchSplit(Params):
@@ -93,6 +90,3 @@ class ScratchConfig(Choosing):
         {}, description="values of 2dgs by its keys (base.densify.grad_threshold=4e-4), and its preset (base.preset)"
     )
     codec: CodecChoice = Field(CodecChoice(name="gaussians-exact"), description="what writes the file")
-
-    def identity(self) -> dict[str, Any]:
-        return identity_before_terms(super().identity())

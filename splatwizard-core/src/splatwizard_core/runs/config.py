@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import hashlib
 import json
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,7 @@ from splatwizard_core.plugins.manager import PluginManager, load_plugins
 from splatwizard_core.scene.dataset import SceneOptions
 from splatwizard_core.scene.loading import family_of
 from splatwizard_core.scene.locate import is_procedural
+from splatwizard_core.training.identity import DEFAULTS, all_values, given_values
 from splatwizard_core.training.keys import block_keys, dotted, field_at, flatten, input_files, set_at, value_at
 from splatwizard_core.training.overrides import apply_overrides, unknown_key
 from splatwizard_core.training.params import OptimizationParams, Params, PipelineParams, SceneParams
@@ -52,6 +54,7 @@ class ResolvedConfig:
     config                  the method's hyper-parameters
     ppl                     run parameters
     scene                   how the scene is read
+    given                   the method's hyper-parameters that differ from their defaults (`training.identity`)
     provenance              dotted key -> "preset 'quick'", "data set 'db'", "rate 'r2'", a file, "--set"; else default
     init                    a .ply that the run starts from in place of a trained scene; empty: none
     pretrained              values by dotted key of the method whose trained scene it starts from, and its "preset"
@@ -66,6 +69,7 @@ class ResolvedConfig:
     config: OptimizationParams
     ppl: PipelineParams
     scene: SceneOptions
+    given: Mapping[str, Any]
     provenance: Mapping[str, str]
     init: str = ""
     pretrained: Mapping[str, Any] = field(default_factory=dict)
@@ -119,20 +123,31 @@ class ResolvedConfig:
         return tomli_w.dumps(_spell_none(content | config))
 
     def training_content(self) -> dict[str, Any]:
-        """Return everything that training depends on: not the `ENCODING` fields, the device or the rate's name.
+        """Return the given values that training depends on: not the `ENCODING` fields, the device or the rate's name.
 
-        A file that it reads counts by what it holds. What it starts from is told apart (`pretrained.training_key`).
+        A file that it reads counts by what it holds. What it starts from is told apart (`runs.identity`).
         """
-        config = self.config_content()
-        for name in type(self.config).ENCODING:
-            config.pop(name, None)
-        told = {"seed", "random_background", "clamp_render", "deterministic", "raster"}
-        run = self.ppl.model_dump(mode="json", include=told)
-        return {"method": self.method, "config": config, "pipeline": run, "scene": self.scene_options}
+        encoding = type(self.config).ENCODING
+        config = {key: value for key, value in self.config_content().items() if key not in encoding}
+        changes = {k: n for k, n in config.pop(DEFAULTS, {}).items() if k.partition(".")[0] not in encoding}
+        if changes:
+            config[DEFAULTS] = changes
+        return self._beside_config(given_values, config)
+
+    def training_values(self) -> dict[str, Any]:
+        """Return what `training_content` does with the values that are defaults, for messages about what differs."""
+        values = {k: v for k, v in all_values(self.config).items() if k not in type(self.config).ENCODING}
+        return self._beside_config(all_values, self._by_content(values))
+
+    def _beside_config(self, values: Callable[[Params], dict[str, Any]], config: dict[str, Any]) -> dict[str, Any]:
+        reading = SceneParams(**self.scene_options)
+        return {"method": self.method, "config": config, "pipeline": values(self.ppl), "scene": values(reading)}
 
     def config_content(self) -> dict[str, Any]:
-        """Return the method's hyper-parameters, with what its input files hold in place of where they lie."""
-        config = self.config.identity()
+        """Return the given hyper-parameters, with what input files hold in place of where they lie."""
+        return self._by_content(copy.deepcopy(dict(self.given)))
+
+    def _by_content(self, config: dict[str, Any]) -> dict[str, Any]:
         for key, digest in self._input_digests.items():
             set_at(config, key, digest)
         return config
@@ -151,12 +166,17 @@ class ResolvedConfig:
         return content_hash(self.training_content())
 
     def config_hash(self) -> str:
-        """Return the SHA-256 over every value of the method, the run and the scene options.
+        """Return the SHA-256 over every given value of the method, the run and the scene options.
 
         Settings of metrics are left out: what a metric's values depend on is the metric's to tell.
         """
-        beside = {k: v for k, v in self.as_dict().items() if k not in ("provenance", "metrics")}
-        return content_hash(beside | {"config": self.config.identity()})
+        content = {
+            "method": self.method, "preset": self.preset, "rate": self.rate, "config": self.given,
+            "pipeline": self.ppl.model_dump(mode="json", exclude_defaults=True),
+            "scene": given_values(SceneParams(**self.scene_options)), **self._beside_blocks(self.init),
+        }  # fmt: skip
+        content.pop("metrics", None)
+        return content_hash(content)
 
 
 def content_hash(content: Any) -> str:
@@ -301,7 +321,8 @@ def resolve(
     config = config.completed(plugins, provenance)
     scene_options = SceneOptions(**reading.model_dump(), seed=ppl.seed)
     return ResolvedConfig(
-        method.name, preset, rate, scene_spec, config, ppl, scene_options, provenance, init, pretrained,
+        method.name, preset, rate, scene_spec, config, ppl, scene_options, given_values(config, plugins), provenance,
+        init, pretrained,
         check_settings(plugins.metrics, settings) if settings else {}, procedural,
     )  # fmt: skip
 

@@ -70,6 +70,11 @@ class StepLog:
         found = self._read().get(step)
         return found["facts"] if found is not None and found["key"] == key else None
 
+    def key_of(self, step: str) -> str | None:
+        """Return the key of the inputs that a step was finished from; None if it was not."""
+        found = self._read().get(step)
+        return None if found is None else str(found["key"])
+
     def finish(self, step: str, key: str, facts: dict[str, Any]) -> None:
         """Remember a finished step."""
         write_json(self.path, {**self._read(), step: {"key": key, "facts": facts}})

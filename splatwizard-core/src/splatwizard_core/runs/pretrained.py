@@ -1,4 +1,4 @@
-"""The trained scene of another method, or of a file, that a training starts from; and the key that identifies both.
+"""The trained scene of another method, or of a file, that a training starts from.
 
 A stage names the method (`starts_from`, `taught_by`). How its scene is trained follows from the run: the same preset if
 that method has it, the same run and scene options, and the values of `pretrained.KEY`. With `init = FILE.ply` the file
@@ -12,19 +12,16 @@ import os
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from splatwizard_core.errors import ConfigError, SplatwizardError, UserInputError
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.method import Method
 from splatwizard_core.plugins import PluginManager, load_plugins
-from splatwizard_core.runs.config import INIT, ResolvedConfig, content_hash, resolve
-from splatwizard_core.runs.session import Session
+from splatwizard_core.runs.config import INIT, ResolvedConfig, resolve
 from splatwizard_core.training.keys import field_at, input_files, is_beside_method, value_at
 from splatwizard_core.training.overrides import apply_overrides
 from splatwizard_core.training.params import PipelineParams
 
-IDENTITY = 2  # raised when checkpoints come to say something else of what they were made from
 PRESET = "preset"  # `pretrained.preset`: of the method that is started from
 
 
@@ -70,31 +67,6 @@ def base_config(plugins: PluginManager, name: str, outer: ResolvedConfig) -> Res
     said = {key: value for key, value in cls.PRESETS[base.preset].items() if field_at(PipelineParams, key) is not None}
     ppl = apply_overrides(outer.ppl, said, source=f"preset '{base.preset}' of '{name}'")
     return replace(base, ppl=ppl, scene=outer.scene)
-
-
-def starts(session: Session, resolved: ResolvedConfig) -> dict[str, dict[str, Any]]:
-    """Map each method that is started from to everything that its scene depends on; empty for most methods."""
-    method = make_method(session.plugins, resolved)
-    found: dict[str, dict[str, Any]] = {}
-    for name in named_scenes(method):
-        if resolved.init and name == first_scene(method):
-            found[name] = {"file": f"sha256 {session.file_digest(Path(resolved.init))}"}
-            continue
-        base = base_config(session.plugins, name, resolved)
-        inner = starts(session, base)
-        version = session.plugins.methods.load(name).version
-        found[name] = {**base.training_content(), "method_version": version}
-        if inner:
-            found[name]["starts from"] = inner
-    return found
-
-
-def training_key(session: Session, resolved: ResolvedConfig) -> str:
-    """Return the key of everything a training is made from: equal keys mean an interchangeable model."""
-    cls = session.plugins.methods.load(resolved.method)
-    before = starts(session, resolved)
-    content = [IDENTITY, resolved.training_hash(), session.scene_digest(resolved), cls.name, cls.version]
-    return content_hash([*content, before] if before else content)
 
 
 def useful_starts(plugins: PluginManager, resolved: ResolvedConfig) -> set[str]:

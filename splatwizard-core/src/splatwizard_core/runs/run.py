@@ -21,8 +21,9 @@ from splatwizard_core.runs.decode import REPEATS
 from splatwizard_core.runs.directory import CONFIG, ENCODED, RENDERS, RunRequest, StepLog, held_directory, write_config
 from splatwizard_core.runs.encode import encode
 from splatwizard_core.runs.fresh import decode_fresh, run_fresh
+from splatwizard_core.runs.identity import training_key
 from splatwizard_core.runs.phases import phases_of_run
-from splatwizard_core.runs.pretrained import make_method, training_key
+from splatwizard_core.runs.pretrained import make_method
 from splatwizard_core.runs.session import Session, TrainedModel
 from splatwizard_core.runs.training import total_seconds, train
 from splatwizard_core.runs.training_views import collapse_warning
@@ -139,7 +140,8 @@ def step_keys(session: Session, resolved: ResolvedConfig, encoding: dict[str, An
     decode = content_hash([sha256, device, MEASURING, encoding["made_by"]])
     evaluate = content_hash(
         [
-            sha256, session.scene_digest(resolved), device, resolved.ppl.raster.model_dump(mode="json"),
+            sha256, session.scene_digest(resolved), device,
+            resolved.ppl.raster.model_dump(mode="json", exclude_none=True),
             session.plugins.metrics.names, MEASURING, used,
         ]
     )  # fmt: skip

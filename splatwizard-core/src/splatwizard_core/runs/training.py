@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from splatwizard_core.runs import pretrained
 from splatwizard_core.runs.config import ResolvedConfig
 from splatwizard_core.runs.contention import contention
 from splatwizard_core.runs.directory import CHECKPOINTS, LOG, RunRequest, StepLog, run_directory
+from splatwizard_core.runs.identity import key_in, stored_beside, stored_key, training_identity, training_key
 from splatwizard_core.runs.lock import directory_lock, is_held
 from splatwizard_core.runs.observers import StartedTraining, watched_by
 from splatwizard_core.runs.phases import StageParts
@@ -43,7 +45,7 @@ def train(session: Session, request: RunRequest, directory: Path, *, stop_after:
     stop_after  end the process's part of the training after this many steps (raises KeyboardInterrupt then)
     """
     resolved = request.resolved
-    key = pretrained.training_key(session, resolved)
+    key = training_key(session, resolved)
     found = session.kept("trained", key)
     if found is None:
         # Starting again takes nothing old, least of all from a neighbour that the same command is about to clear.
@@ -53,7 +55,8 @@ def train(session: Session, request: RunRequest, directory: Path, *, stop_after:
         if home != directory and home.parent.name == CACHE and not (directory / LOG).exists():
             write_atomic(directory / LOG, (home / LOG).read_text("utf-8"))  # reports look for it here
     steps = StepLog(directory)
-    if steps.done(STEP, key) is None:  # then it uses the training of another directory, which is noted in this one
+    if steps.done(STEP, key) is None and _finished(session, directory, key) is None:
+        # It uses the training of another directory, which is noted in this one.
         other = found.facts.get("trained_in")
         made = "that others started from" if other == resolved.rate else f"of {other}"
         session.say(f"rate point {resolved.rate} shares the training {made}")
@@ -64,7 +67,7 @@ def train(session: Session, request: RunRequest, directory: Path, *, stop_after:
 def _trained_in(home: Path, session: Session, request: RunRequest, key: str, stop_after: int | None) -> TrainedModel:
     """Train in the directory `home`, or load what is finished there."""
     resolved, plugins = request.resolved, session.plugins
-    steps, done = StepLog(home), _finished(home, key)
+    steps, done = StepLog(home), _finished(session, home, key)
     if done is None:
         scene = session.scene(resolved)
         session.say(f"training {resolved.method} on {scene.name} ({resolved.preset} preset, {session.device})")
@@ -95,17 +98,17 @@ def trained_scene(session: Session, name: str, outer: ResolvedConfig, out: Path)
         session.say_once(f"{outer.method} starts from {outer.init} in place of a trained {name} scene")
         return session.once(("model", outer.init), lambda: _scene_of_file(session, Path(outer.init)))
     resolved = pretrained.base_config(session.plugins, name, outer)
-    key = pretrained.training_key(session, resolved)
+    key = training_key(session, resolved)
     kept = session.kept("start", key)
     if kept is not None:
         return kept
     request, cached = RunRequest(resolved, out), cached_directory(session, resolved, out)
     homes = [*_folders(run_directory(request).parent), cached]
     begun = (each for each in homes if StepLog(each).done(BEGUN, key) is not None and is_held(each))
-    directory = _first_finished(homes, key) or next(begun, cached)
+    directory = _first_finished(session, homes, key) or next(begun, cached)
     with directory_lock(directory, wait=True, say=session.say):
         sweep(directory)
-        if StepLog(directory).done(STEP, key) is not None:
+        if _finished(session, directory, key) is not None:
             session.say_once(f"{outer.method} starts from the trained {name} scene in {directory}")
         elif CheckpointStore(directory / CHECKPOINTS).paths():
             session.say(f"the trained {name} scene for this configuration is not finished yet: going on with it first")
@@ -125,9 +128,19 @@ def _scene_of_file(session: Session, path: Path) -> TrainedModel:
 
 
 def cached_directory(session: Session, resolved: ResolvedConfig, out: Path) -> Path:
-    """Return where the trained scene of a configuration is kept for those that start from it."""
-    key = pretrained.training_key(session, resolved)
-    return out / CACHE / f"{session.scene(resolved).name}-{resolved.method}-{key[:16]}"
+    """Return where the trained scene of a configuration is kept for those that start from it.
+
+    The folder is named by the key; one that another release named is found by what its checkpoint says.
+    """
+    key = training_key(session, resolved)
+    folder, name = out / CACHE, f"{session.scene(resolved).name}-{resolved.method}-"
+    found = folder / f"{name}{key[:16]}"
+    if not found.exists():
+        for each in (each for each in _folders(folder) if re.fullmatch(r"[0-9a-f]{16}", each.name.removeprefix(name))):
+            stored = CheckpointStore(each / CHECKPOINTS).identity()
+            if stored is not None and stored_key(session.plugins, stored) == key:
+                return each
+    return found
 
 
 def finished_directory(session: Session, request: RunRequest, directory: Path) -> Path | None:
@@ -135,18 +148,25 @@ def finished_directory(session: Session, request: RunRequest, directory: Path) -
     cache's."""
     cached = cached_directory(session, request.resolved, request.out)
     homes = [directory, *_folders(directory.parent), cached]
-    return _first_finished(homes, pretrained.training_key(session, request.resolved))
+    return _first_finished(session, homes, training_key(session, request.resolved))
 
 
-def _first_finished(homes: Iterable[Path], key: str) -> Path | None:
-    return next((each for each in homes if _finished(each, key) is not None), None)
+def _first_finished(session: Session, homes: Iterable[Path], key: str) -> Path | None:
+    return next((each for each in homes if _finished(session, each, key) is not None), None)
 
 
-def _finished(directory: Path, key: str) -> dict[str, Any] | None:
-    """Return the facts of this training if a run directory holds it, finished, with its own checkpoints."""
-    facts = StepLog(directory).done(STEP, key)
-    own = facts is not None and "checkpoints" not in facts and CheckpointStore(directory / CHECKPOINTS).paths()
-    return facts if own else None
+def _finished(session: Session, directory: Path, key: str) -> dict[str, Any] | None:
+    """Return the facts of this training if a run directory holds it, finished, with its own checkpoints.
+
+    Of another release it has another key there, and is known by what its checkpoint says.
+    """
+    under = StepLog(directory).key_of(STEP)
+    if under is None or not CheckpointStore(directory / CHECKPOINTS).paths():
+        return None
+    facts = StepLog(directory).done(STEP, under)
+    if facts is None or "checkpoints" in facts:
+        return None
+    return facts if key == under or key_in(session, directory, under) == key else None
 
 
 def _folders(parent: Path) -> list[Path]:
@@ -200,15 +220,7 @@ def _train_stages(
         )  # fmt: skip
         return {name: metric.mean for name, metric in result.metrics.items() if metric.mean is not None}
 
-    scenes_before = pretrained.starts(session, resolved)
-    # The content besides its key, so that a refused resume can say what differs.
-    identity = {
-        **resolved.training_content(),
-        "identity": pretrained.IDENTITY,
-        "method_version": method.version,
-        "scene content": session.scene_digest(resolved),
-        **({"starts from": scenes_before} if scenes_before else {}),
-    }
+    identity = training_identity(session, resolved)
     if ppl.eval_every:
         decode_all(scene.test)  # here, so that they do not count as memory of the training
     started = StartedTraining(resolved.method, directory, scene, rasterizer, ppl.log)
@@ -221,6 +233,7 @@ def _train_stages(
             scene, ppl, rasterizer,
             directory=directory / CHECKPOINTS, identity=identity, trained=frozen, stop_after=stop_after,
             resume=request.resume, allow_changed_plan=request.allow_changed_plan, on_step=after_step,
+            read_identity=lambda stored: stored_beside(plugins, stored, identity),
             evaluate=test_metrics, log_path=directory / LOG, provided=parts.since_asked,
         ).train()  # fmt: skip
     return outcome.model, {

@@ -47,7 +47,12 @@ def block_keys(cls: type[BaseModel]) -> dict[str, str]:
 
 def input_files(cls: type[BaseModel]) -> list[str]:
     """List the dotted keys of the fields that name a file which training reads."""
-    return [key for key, field in leaves(cls) if any(isinstance(mark, ReadsFile) for mark in field.metadata)]
+    return marked(cls, ReadsFile)
+
+
+def marked(cls: type[BaseModel], mark: type) -> list[str]:
+    """List the dotted keys of the fields whose type is annotated with an instance of `mark`."""
+    return [key for key, field in leaves(cls) if any(isinstance(each, mark) for each in field.metadata)]
 
 
 def field_at(cls: type[BaseModel], key: str) -> Any:
@@ -77,6 +82,14 @@ def set_at(content: dict[str, Any], key: str, value: Any) -> None:
             content[part] = {}
         content = content[part]
     content[last] = value
+
+
+def remove_at(content: dict[str, Any], key: str) -> None:
+    """Remove the value at a dotted key of nested dicts, if there is one."""
+    *path, last = key.split(".")
+    for part in path:
+        content = content.get(part, {})
+    content.pop(last, None)
 
 
 def flatten(cls: type[BaseModel], tables: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -3,11 +3,13 @@
 import dataclasses
 import typing
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, create_model, model_serializer
+from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from splatwizard_core.scene.dataset import SceneOptions
+
+ParamsT = TypeVar("ParamsT", bound="Params")
 
 
 class ReadsFile:
@@ -18,10 +20,39 @@ InputFile = Annotated[str, ReadsFile()]
 """The type of a field for the path of a file that training reads; empty for none."""
 
 
+class SameResult:
+    """Marks a field that says how something is computed, not what: trainings that differ in it alone are the same."""
+
+
+HowInt = Annotated[int, SameResult()]
+HowBool = Annotated[bool, SameResult()]
+
+
 class Params(BaseModel):
-    """Base of every configuration block: unknown keys and values out of bounds are errors; blocks may nest."""
+    """Base of every configuration block: unknown keys and values out of bounds are errors; blocks may nest.
+
+    Trainings are told apart by the values that differ from the defaults. So a new key whose default changes nothing
+    leaves every finished training as it is, and a changed default has to be counted:
+
+    DEFAULTS    how often a default that this very class states was changed since release 0.3
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False)
+    DEFAULTS: ClassVar[int] = 0
+
+    def normal(self: ParamsT, plugins: Any) -> ParamsT:
+        """Return this with each value that changes no result at its default, in nested blocks too.
+
+        plugins     the PluginManager, for blocks whose values belong to something that is registered
+        """
+        changed: dict[str, Any] = {}
+        for name, field in type(self).model_fields.items():
+            value = getattr(self, name)
+            if any(isinstance(mark, SameResult) for mark in field.metadata):
+                changed[name] = field.get_default(call_default_factory=True)
+            elif isinstance(value, Params):
+                changed[name] = value.normal(plugins)
+        return self.model_copy(update=changed)
 
 
 class RasterParams(Params):
@@ -42,19 +73,16 @@ class RasterParams(Params):
     @property
     def options(self) -> dict[str, Any]:
         """Values of `RasterOptions` that the user has decided."""
-        return self.model_dump(exclude={"prefer", "forbid"})
-
-    @model_serializer(mode="wrap")
-    def _given(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        # None is left out: a configuration that decides nothing keeps the hash that it had before there were options.
-        return {name: value for name, value in handler(self).items() if value is not None}
+        return self.model_dump(exclude={"prefer", "forbid"}, exclude_none=True)
 
 
 class LogParams(Params):
     """Programs that a training is logged for besides log.jsonl: observers of `run_started` read it."""
 
-    tensorboard: bool = Field(False, description="write the curves for TensorBoard too, into tensorboard/ of the run")
-    view: int = Field(0, ge=0, le=65535, description="port where a viewer shows the training; 0: nowhere")
+    tensorboard: HowBool = Field(
+        False, description="write the curves for TensorBoard too, into tensorboard/ of the run"
+    )
+    view: HowInt = Field(0, ge=0, le=65535, description="port where a viewer shows the training; 0: nowhere")
 
 
 class PipelineParams(Params):
@@ -63,25 +91,23 @@ class PipelineParams(Params):
     seed: int = Field(
         0, ge=0, description="one integer; init, sampler, split, background and method streams derive from it"
     )
-    device: Literal["auto", "cpu", "cuda"] = Field("auto", description="auto: CUDA if its kernels can run, else CPU")
-    threads: int = Field(0, ge=0, le=1024, description="CPU threads; 0: all cores that this process may use")
-    checkpoint_every: int = Field(1000, ge=1, description="steps between checkpoints")
-    log_every: int = Field(10, ge=1, description="steps between lines of log.jsonl")
-    keep_checkpoints: int = Field(1, ge=1, description="how many of the newest checkpoints stay")
-    eval_every: int = Field(0, ge=0, description="steps between evaluations on the test views; 0: only at the end")
-    eval_train: bool = Field(True, description="draw the training views once at the end and record their PSNR")
+    device: Annotated[Literal["auto", "cpu", "cuda"], SameResult()] = Field(
+        "auto", description="auto: CUDA if its kernels can run, else CPU"
+    )
+    threads: HowInt = Field(0, ge=0, le=1024, description="CPU threads; 0: all cores that this process may use")
+    checkpoint_every: HowInt = Field(1000, ge=1, description="steps between checkpoints")
+    log_every: HowInt = Field(10, ge=1, description="steps between lines of log.jsonl")
+    keep_checkpoints: HowInt = Field(1, ge=1, description="how many of the newest checkpoints stay")
+    eval_every: HowInt = Field(0, ge=0, description="steps between evaluations on the test views; 0: only at the end")
+    eval_train: HowBool = Field(True, description="draw the training views once at the end and record their PSNR")
     random_background: bool = Field(False, description="a fresh background colour per step in training")
     clamp_render: bool = Field(False, description="clamp the render to [0,1] before the loss (inria 2024)")
     deterministic: bool = Field(False, description="equal runs give equal bits on CUDA too; slower, more memory")
-    profile: Literal["none", "stages"] = Field("none", description="stages: time each stage of a step")
+    profile: Annotated[Literal["none", "stages"], SameResult()] = Field(
+        "none", description="stages: time each stage of a step"
+    )
     raster: RasterParams = Field(RasterParams(), description="which rasterizers may serve")
     log: LogParams = Field(LogParams(), description="where else the training is logged")
-
-    @model_serializer(mode="wrap")
-    def _given(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        # Left out at their defaults: a configuration keeps the hash that it had before there were these keys.
-        told = {"log": self.log != LogParams(), "deterministic": self.deterministic, "eval_train": not self.eval_train}
-        return {key: value for key, value in handler(self).items() if told.get(key, True)}
 
 
 _fields: dict[str, Any] = {f.name: f.default for f in dataclasses.fields(SceneOptions) if f.name != "seed"}
@@ -95,10 +121,13 @@ class OptimizationParams(Params):
 
     FULL_ITERATIONS     the run length that the method's plans are written for
     ENCODING            fields that only `encode` reads: rate points that differ in these alone share their training
+    ABSENT              dotted key -> value of trainings of release 0.2 and before that do not tell it, if it is not
+                        the default
     """
 
     FULL_ITERATIONS: ClassVar[int] = 30_000
     ENCODING: ClassVar[tuple[str, ...]] = ("codec",)
+    ABSENT: ClassVar[Mapping[str, Any]] = {}
 
     iterations: int = Field(30_000, ge=1, description="steps; plans keep their ranges, tasks past the end never fire")
     scale_schedule: bool = Field(
@@ -122,7 +151,3 @@ class OptimizationParams(Params):
     def completed(self, plugins: Any, sources: Mapping[str, str]) -> "OptimizationParams":
         """Return this with checked settings of what it names in `plugins`; sources: dotted key -> who gave a value."""
         return self
-
-    def identity(self) -> dict[str, Any]:
-        """Return all values, plain: equal ones make equal models. Renamed keys stand here under their first names."""
-        return self.model_dump(mode="json")

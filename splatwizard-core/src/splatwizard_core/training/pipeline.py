@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,13 @@ from splatwizard_core.rendering.features import Feature
 from splatwizard_core.rendering.rasterizer import Rasterizer
 from splatwizard_core.scene.images import decode_all, keep_pictures
 from splatwizard_core.scene.scene import Scene
-from splatwizard_core.training.checkpoint import Checkpoint, CheckpointStore, DamagedCheckpointError, differences
+from splatwizard_core.training.checkpoint import (
+    Checkpoint,
+    CheckpointStore,
+    DamagedCheckpointError,
+    differences,
+    normalised,
+)
 from splatwizard_core.training.housekeeping import Evaluate, Housekeeping, OnStep, Progress
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.plan import plan_rows
@@ -63,6 +69,7 @@ class TrainingRun:
     directory       where checkpoints are written and looked for; None: nothing is kept
     identity        what the result depends on besides the plan (method, version, resolved configuration), JSON-able;
                     a checkpoint of another identity is refused
+    read_identity   identity in a checkpoint of any release -> the same as `identity` would say it
     trained         (method name) -> a frozen, trained model of this scene
     stop_after      stop after this step, counted over all stages: a checkpoint is written and TrainingStopped raised
     resume          go on from the newest checkpoint; False: remove what the directory holds and start again
@@ -83,6 +90,7 @@ class TrainingRun:
     directory: Path | None
     identity: Mapping[str, Any]
     trained: Callable[[str], SplatModel]
+    read_identity: Callable[[Mapping[str, Any]], Mapping[str, Any]] = dict
     stop_after: int | None = None
     resume: bool = True
     allow_changed_plan: bool = False
@@ -198,7 +206,8 @@ class TrainingRun:
             raise CheckpointError(f"the checkpoint is of stage {saved.stage}, this run has {len(self.stages)} stages")
         trainer = self._trainer(saved.stage, self._before(saved.stage))
         where = f"the checkpoint of stage '{saved.stage_name}', step {saved.step},"
-        changed = differences(saved, self.identity, trainer.plan_lines(), self.scene.extent)
+        told = replace(saved, identity=normalised(self.read_identity(saved.identity)))
+        changed = differences(told, self.identity, trainer.plan_lines(), self.scene.extent)
         if changed and not self.allow_changed_plan:
             more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
             raise CheckpointError(
