@@ -52,7 +52,10 @@ def test_the_key_of_today_is_that_of_the_same_values(name: str, case: dict[str, 
     other = training_identity(session, asked(name, case, iterations=7))
     told = dotted(normalised(stored_beside(session.plugins, case["identity"], other)), "")
     differing = {key for key, value in dotted(normalised(other), "").items() if told.get(key) != value}
-    assert differing - {"config.growth.subvoxel"} == {"config.iterations"}
+    # A method that is built on another gives its length to that one.
+    assert {key for key in differing if not key.startswith("built on.")} - {"config.growth.subvoxel"} == {
+        "config.iterations"
+    }
 
 
 @pytest.mark.parametrize(("name", "case"), CASES)

@@ -60,6 +60,10 @@ class Method:
         """Return the training stages in order."""
         raise NotImplementedError
 
+    def borrows(self) -> Sequence[Method]:
+        """Return the configured methods that the stages are built on: their values tell trainings apart too."""
+        return []
+
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         """Write everything that `decode` needs; must leave `model` as it is."""
         raise NotImplementedError

@@ -52,6 +52,9 @@ class ChimeraGS(Method):
         preset = str(values.pop("preset", "paper"))
         return create_method(self.plugins, name, values, preset=preset)
 
+    def borrows(self) -> Sequence[Method]:
+        return [self._student()]
+
     def create_model(self, scene: Scene, generator: torch.Generator) -> SplatModel:
         return self._student().create_model(scene, generator)
 

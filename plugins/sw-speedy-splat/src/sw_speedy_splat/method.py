@@ -35,6 +35,9 @@ class SpeedySplat(GaussianMethod):
         length = {"iterations": self.config.iterations, "scale_schedule": self.config.scale_schedule}
         return create_method(self.plugins, "3dgs", {**length, **values}, preset=preset)
 
+    def borrows(self) -> Sequence[Method]:
+        return [self._base()]
+
     def create_model(self, scene: Scene, generator: torch.Generator) -> SplatModel:
         return self._base().create_model(scene, generator)
 

@@ -68,6 +68,9 @@ class Trim2DGSScratch(GaussianMethod):
             )
         return create_method(self.plugins, "2dgs", {**own, **values}, preset=preset)
 
+    def borrows(self) -> Sequence[Method]:
+        return [self._base()]
+
     def create_model(self, scene: Scene, generator: torch.Generator) -> SplatModel:
         return self._base().create_model(scene, generator)
 

@@ -1,20 +1,22 @@
 """What a training is made from: its key, and what a checkpoint says of it, read with the configurations of today.
 
-Equal keys mean an interchangeable model. A key is over the values that differ from the defaults, the version of the
-method, what the scene holds and the same of each trained scene that it starts from. A checkpoint holds all values
-instead, defaults too: so a training of another release is known by its values, whatever has become of keys and
-defaults since.
+Equal keys mean an interchangeable model. A key is over the values that differ from the defaults, those of methods that
+it is built on too, the version of the method, what the scene holds, and the same of each trained scene that it starts
+from. A checkpoint holds all values instead, defaults too: so a training of another release is known by its values,
+whatever has become of keys and defaults since.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
 from splatwizard_core.errors import SplatwizardError
+from splatwizard_core.method import Method
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.runs.config import ResolvedConfig, content_hash
 from splatwizard_core.runs.directory import CHECKPOINTS
@@ -31,7 +33,8 @@ FORMAT = 3  # raised when checkpoints come to say something else of what they we
 ALL_VALUES = 3  # first format with all values; those before left out keys that were at their defaults
 KEY = "key"  # of the training, as the release that made it had it
 _NOT_OF_TODAY = (SplatwizardError, ValidationError, KeyError, TypeError, ValueError)
-_BESIDE = {"method", "config", "pipeline", "scene", "method_version", "starts from"}
+BEFORE, BORROWED = "starts from", "built on"
+_PARTS = {"method", "config", "pipeline", "scene", "method_version", BEFORE, BORROWED}
 
 
 def training_key(session: Session, resolved: ResolvedConfig) -> str:
@@ -60,7 +63,25 @@ def _content(session: Session, resolved: ResolvedConfig, *, all_values: bool) ->
         else:
             before[name] = _content(session, base_config(session.plugins, name, resolved), all_values=all_values)
     content = resolved.training_values() if all_values else resolved.training_content()
-    return {**content, "method_version": type(method).version, **({"starts from": before} if before else {})}
+    borrowed = _borrowed(method, resolved, all_values=all_values)
+    return {**content, "method_version": type(method).version, **_named({BORROWED: borrowed, BEFORE: before})}
+
+
+def _borrowed(method: Method, resolved: ResolvedConfig, *, all_values: bool) -> dict[str, Any]:
+    """Return what a training depends on of the methods that its stages are built on, and of those that these are."""
+    found: dict[str, Any] = {}
+    for other in method.borrows():
+        its = replace(
+            resolved, method=other.name, config=other.config, given=given_values(other.config, method.plugins)
+        )
+        content = its.training_values() if all_values else its.training_content()
+        inner = _borrowed(other, its, all_values=all_values)
+        found[other.name] = {"config": content["config"], **_named({BORROWED: inner})}
+    return found
+
+
+def _named(blocks: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: block for name, block in blocks.items() if block}
 
 
 def stored_config(plugins: PluginManager, stored: Mapping[str, Any], *, absent: bool = False) -> ResolvedConfig:
@@ -128,7 +149,7 @@ def key_when_made(stored: Mapping[str, Any]) -> str:
         return str(stored.get(KEY))
     told = content_hash({k: stored[k] for k in ("method", "config", "pipeline", "scene")})
     parts = [stored["identity"], told, stored["scene content"], stored["method"], stored["method_version"]]
-    return content_hash([*parts, stored["starts from"]] if "starts from" in stored else parts)
+    return content_hash([*parts, stored[BEFORE]] if BEFORE in stored else parts)
 
 
 def key_in(session: Session, directory: Path, finished_as: str) -> str | None:
@@ -159,9 +180,22 @@ def _today(plugins: PluginManager, stored: Mapping[str, Any], partial: bool, *, 
     resolved = stored_config(plugins, stored, absent=partial)
     content = resolved.training_values() if all_values else resolved.training_content()
     before = {
-        name: _today(plugins, inner, partial, all_values=all_values)
-        for name, inner in stored.get("starts from", {}).items()
+        name: _today(plugins, inner, partial, all_values=all_values) for name, inner in stored.get(BEFORE, {}).items()
     }
-    beside = {k: v for k, v in stored.items() if k not in _BESIDE and all_values}
+    if partial:  # it does not tell what it was built on, which follows from its values
+        borrowed = _borrowed(make_method(plugins, resolved), resolved, all_values=all_values)
+    else:
+        borrowed = _borrowed_today(plugins, stored, all_values=all_values)
+    beside = {k: v for k, v in stored.items() if k not in _PARTS and all_values}
     version = {"method_version": stored["method_version"]}
-    return {**beside, **content, **version, **({"starts from": before} if before else {})}
+    return {**beside, **content, **version, **_named({BORROWED: borrowed, BEFORE: before})}
+
+
+def _borrowed_today(plugins: PluginManager, stored: Mapping[str, Any], *, all_values: bool) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, inner in stored.get(BORROWED, {}).items():
+        its = stored_config(plugins, {"method": name, "pipeline": {}, "scene": {}, **inner})
+        content = its.training_values() if all_values else its.training_content()
+        deeper = _borrowed_today(plugins, inner, all_values=all_values)
+        found[name] = {"config": content["config"], **_named({BORROWED: deeper})}
+    return found
