@@ -271,7 +271,6 @@ def time_method(method: str, args: argparse.Namespace) -> None:
     from splatwizard_core.scene.images import decode_all, keep_pictures
 
     session = Session(load_plugins(), torch.device(args.device), lambda line: print(line, file=sys.stderr))
-    session.load_kernels()
     resolved, _ = resolved_method(method, args, session.plugins)
     scene = session.scene(resolved)
     decode_all(scene.train)

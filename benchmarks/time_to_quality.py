@@ -107,7 +107,6 @@ def trained(job: Job) -> dict[str, Any]:
     if device.type == "cpu" and job.threads:
         torch.set_num_threads(job.threads)
     session = Session(plugins, device, lambda line: print(line, file=sys.stderr))
-    session.load_kernels()
     scene, method = session.scene(resolved), make_method(plugins, resolved)
     rasterizer = NegotiatedRasterizer(plugins, device=device)
     stages, ppl = list(method.stages()), resolved.ppl

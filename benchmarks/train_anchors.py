@@ -33,7 +33,6 @@ import itertools
 import math
 import os
 import sys
-import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
@@ -65,7 +64,7 @@ from splatwizard_core.streams import stream
 from splatwizard_core.training.rng import Streams
 from splatwizard_core.training.stage import StageContext
 from splatwizard_core.training.trainer import StepRecord, Trainer
-from splatwizard_native import seeded
+from splatwizard_native import seeded, work_time
 from sw_codecs.context import spatial_ar, triplane
 
 # Attribute paths from the trainer -> the part of a step that its calls belong to; what a version lacks is left out.
@@ -223,7 +222,7 @@ class Watch:
     def _now(self) -> float:
         if self.device.type == "cuda":
             torch.cuda.synchronize()
-        return time.perf_counter()
+        return work_time()
 
 
 def _activities(device: torch.device) -> list[ProfilerActivity]:
@@ -394,7 +393,7 @@ def explicit(
         if record.step in (steps // 5, steps):
             if session.device.type == "cuda":
                 torch.cuda.synchronize()
-            clock[record.step] = time.perf_counter()
+            clock[record.step] = work_time()
 
     def run() -> None:
         trainer.run(steps, after)
@@ -423,7 +422,6 @@ def main() -> None:
     if args.device == "cuda" and not torch.cuda.is_available():
         sys.exit("torch sees no CUDA device here")
     session = Session(load_plugins(), torch.device(args.device), lambda line: print(line, file=sys.stderr))
-    session.load_kernels()
     where = torch.cuda.get_device_name(0) if args.device == "cuda" else f"CPU, {torch.get_num_threads()} thread(s)"
     print(f"{where}, torch {torch.__version__}")
     scenes: dict[tuple[str, str], Scene] = {}

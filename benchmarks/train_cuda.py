@@ -28,7 +28,6 @@ import json
 import statistics
 import subprocess
 import sys
-import time
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -48,6 +47,7 @@ from splatwizard_core.runs.session import Session
 from splatwizard_core.streams import stream
 from splatwizard_core.training.pipeline import TrainingRun
 from splatwizard_core.training.trainer import StepRecord
+from splatwizard_native import work_time
 
 WINDOW = 40  # steps that are timed, and as many after them that are profiled
 MIB = 1 << 20
@@ -89,10 +89,10 @@ class Watch:
         for start in self.starts:
             if record.step == start:
                 torch.cuda.synchronize()
-                self._since = time.perf_counter()
+                self._since = work_time()
             elif record.step == start + WINDOW:
                 torch.cuda.synchronize()
-                self._wall = (time.perf_counter() - self._since) / WINDOW
+                self._wall = (work_time() - self._since) / WINDOW
                 self._profile = profile(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA])
                 self._profile.__enter__()
             elif record.step == start + 2 * WINDOW and self._profile is not None:
@@ -141,7 +141,6 @@ def ours(folder: str, pictures: str | None, args: argparse.Namespace, watch: Wat
         sets |= {**after, "surface.lambda_dist": args.distortion, "surface.lambda_normal": 0.05}
     resolved = resolve(plugins.methods.load(plan_of(args)), "paper", sets=sets, scene=folder)
     session = Session(plugins, torch.device("cuda"), lambda line: print(line, file=sys.stderr))
-    session.load_kernels()
     scene = session.scene(resolved)
     method = make_method(plugins, resolved)
     rasterizer = NegotiatedRasterizer(plugins, device=session.device)

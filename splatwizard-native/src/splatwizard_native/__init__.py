@@ -65,6 +65,8 @@ if TYPE_CHECKING:
     from splatwizard_native.strict_json import dump_strict as dump_strict
     from splatwizard_native.strict_json import load_strict as load_strict
     from splatwizard_native.toolchain import find_compiler as find_compiler
+    from splatwizard_native.work_clock import loading_time as loading_time
+    from splatwizard_native.work_clock import work_time as work_time
 
 # Imported on first use: who only catches the errors, as every command does, need not wait for the rest.
 MODULES = {
@@ -92,6 +94,7 @@ MODULES = {
     "settings": "cache_root",
     "strict_json": "dump_strict load_strict",
     "toolchain": "find_compiler",
+    "work_clock": "loading_time work_time",
 }
 """Module -> the names that are offered here."""
 

@@ -28,6 +28,7 @@ from splatwizard_native.library import architectures_of, install, is_intact, loa
 from splatwizard_native.lock import build_lock
 from splatwizard_native.settings import SWITCHED_OFF, build_timeout, cache_root, switched_off
 from splatwizard_native.toolchain import Job, Toolchain
+from splatwizard_native.work_clock import loading
 
 log = logging.getLogger(__name__)
 
@@ -87,7 +88,8 @@ class NativeModule:
         if session.error is not None:
             raise session.error
         try:
-            self._load(say)
+            with loading():
+                self._load(say)
         except NativeBuildError as error:
             if not switched_off():  # the environment is asked anew each time
                 session.error = error

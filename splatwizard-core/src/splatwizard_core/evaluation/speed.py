@@ -11,7 +11,6 @@ from __future__ import annotations
 import itertools
 import math
 import statistics
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
@@ -20,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatwizard_native import MemoryMeter, synchronize, track
+from splatwizard_native import MemoryMeter, synchronize, track, work_time
 
 WARMUP_FRAMES = 10
 CUDA_FRAMES = 100
@@ -92,12 +91,12 @@ def measure_speed(
         """Draw frames, waiting for the device at both ends alone; each is consumed, so that none can be left undone."""
         nonlocal sink
         synchronize(device)
-        began = time.perf_counter()
+        began = work_time()
         for view in frames:
             total = render(view).sum()
             sink = total if sink is None else sink + total
         synchronize(device)
-        return time.perf_counter() - began
+        return work_time() - began
 
     warmup = max(len(views), WARMUP_FRAMES)
     rounds = 1

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import statistics
-import time
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -22,7 +21,7 @@ from splatwizard_core.plugins import PluginManager
 from splatwizard_core.runs.contention import contention
 from splatwizard_core.runs.file_needs import missing_plugin, other_versions, upgrade_command
 from splatwizard_core.runs.session import Session
-from splatwizard_native import CoreTime, MemoryMeter, replacing, synchronize, track
+from splatwizard_native import CoreTime, MemoryMeter, loading_time, replacing, synchronize, track, work_time
 
 REPEATS = 3
 
@@ -87,7 +86,7 @@ def timed_decode(path: Path, session: Session, *, repeats: int = REPEATS) -> tup
     decode_s            median of `decode_runs_s`: from opening the file to a model on the device
     decode_spread       how much the timed decodes differ; None for fewer than two
     first_decode_s      of the decode before the timed ones, which imports what is imported late
-    jit_s               loading (or compiling) the native modules, before all decodes
+    jit_s               loading or compiling native modules; in no other figure
     peak_bytes          memory growth over the first decode; `memory_kind` says of what
 
     Raises SplatwizardError if two decodes give different models.
@@ -96,15 +95,12 @@ def timed_decode(path: Path, session: Session, *, repeats: int = REPEATS) -> tup
 
     def once() -> tuple[SplatModel, ContainerReader, float]:
         synchronize(device)
-        began = time.perf_counter()
+        began = work_time()
         model, reader = open_model(path, session.plugins, device)
         synchronize(device)
-        return model, reader, time.perf_counter() - began
+        return model, reader, work_time() - began
 
     import_method(path, session.plugins)
-    began = time.perf_counter()
-    session.load_kernels()
-    jit_s = time.perf_counter() - began
     meter = MemoryMeter(device)
     meter.start()
     with track(f"decode {path.name}", total=1 + repeats) as bar:
@@ -136,7 +132,7 @@ def timed_decode(path: Path, session: Session, *, repeats: int = REPEATS) -> tup
         "decode_runs_s": runs,
         "decode_spread": asdict(spread(runs)) if len(runs) > 1 else None,
         "first_decode_s": first,
-        "jit_s": jit_s,
+        "jit_s": loading_time(),
         "contended": contended,
         "peak_bytes": peak,
         "memory_kind": meter.kind,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib.metadata
-import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,7 @@ from splatwizard_core.runs.pretrained import make_method
 from splatwizard_core.runs.session import Session, TrainedModel
 from splatwizard_core.runs.training import finished_directory, train
 from splatwizard_core.runs.versions import made_by
-from splatwizard_native import CoreTime, file_sha256, one_order_of_sums, synchronize
+from splatwizard_native import CoreTime, file_sha256, one_order_of_sums, synchronize, work_time
 
 NEEDED_KINDS = ("method", "quantizer", "entropy model", "context model", "coder")
 """Kinds that a decoder may want again; a pruner or a rasterizer has done its work by then."""
@@ -46,7 +45,7 @@ def encode(
     """
     before = model.digest()
     synchronize(model.device)
-    cores, began = CoreTime(), time.perf_counter()
+    cores, began = CoreTime(), work_time()
     writer = ContainerWriter(method.name, method.version, raster=raster)
     ordered = one_order_of_sums() if deterministic else contextlib.nullcontext()
     with torch.no_grad(), ordered, method.plugins.recording() as loaded:
@@ -57,7 +56,7 @@ def encode(
     writer.requires = requirements(loaded)
     size = writer.write(path)
     synchronize(model.device)
-    seconds, contended = time.perf_counter() - began, contention("encode", cores)
+    seconds, contended = work_time() - began, contention("encode", cores)
     if model.digest() != before:
         raise SplatwizardError(f"method '{method.name}' changed the model while encoding it, which it may not")
     return {
@@ -106,7 +105,6 @@ def encode_directory(session: Session, resolved: ResolvedConfig, directory: Path
 
 def encode_ply(session: Session, resolved: ResolvedConfig, path: Path, target: Path) -> dict[str, Any]:
     """Encode the explicit Gaussians of a .ply. Raises UserInputError for methods that do not encode such."""
-    session.load_kernels()
     if session.plugins.importers.of_suffix(path) is None:
         raise UserInputError(f"{path}: `sw encode` takes a run directory or a .ply")
     model = session.plugins.read_gaussians(path).to(session.device).eval().requires_grad_(False)

@@ -19,12 +19,10 @@ from splatwizard_core.errors import SplatwizardError
 from splatwizard_core.method import Method
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.runs.config import ResolvedConfig, content_hash
-from splatwizard_core.runs.directory import CHECKPOINTS
 from splatwizard_core.runs.pretrained import base_config, first_scene, make_method, named_scenes
 from splatwizard_core.runs.record import Record
 from splatwizard_core.runs.session import Session
 from splatwizard_core.scene.dataset import SceneOptions
-from splatwizard_core.training.checkpoint import CheckpointStore
 from splatwizard_core.training.identity import given_values
 from splatwizard_core.training.keys import dotted, flatten, set_at
 from splatwizard_core.training.params import PipelineParams, SceneParams
@@ -122,9 +120,14 @@ def stored_beside(plugins: PluginManager, stored: Mapping[str, Any], identity: M
     return {**values, "identity": FORMAT, KEY: identity[KEY]}
 
 
-def stored_key(plugins: PluginManager, stored: Mapping[str, Any]) -> str | None:
-    """Return the key that the training in a checkpoint has today; None where today's method cannot have its values."""
+def stored_key(plugins: PluginManager, stored: Mapping[str, Any], *, finished_as: str | None = None) -> str | None:
+    """Return the key that the training in a checkpoint has today; None where today's method cannot have its values.
+
+    finished_as     key under which the steps beside it are finished: None too where it is of another training
+    """
     try:
+        if finished_as is not None and key_when_made(stored) != finished_as:
+            return None
         content = _today(plugins, stored, _is_partial(stored), all_values=False)
         content["scene content"] = stored["scene content"]
     except _NOT_OF_TODAY:
@@ -150,23 +153,6 @@ def key_when_made(stored: Mapping[str, Any]) -> str:
     told = content_hash({k: stored[k] for k in ("method", "config", "pipeline", "scene")})
     parts = [stored["identity"], told, stored["scene content"], stored["method"], stored["method_version"]]
     return content_hash([*parts, stored[BEFORE]] if BEFORE in stored else parts)
-
-
-def key_in(session: Session, directory: Path, finished_as: str) -> str | None:
-    """Return the key that the training in a run directory has today, if its steps call it finished under `finished_as`.
-
-    None: its checkpoints are gone, cannot be read or are of another training than its steps.
-    """
-
-    def found() -> str | None:
-        stored = CheckpointStore(directory / CHECKPOINTS).identity() or {}
-        try:
-            same = key_when_made(stored) == finished_as
-        except KeyError:
-            return None
-        return stored_key(session.plugins, stored) if same else None
-
-    return session.once(("key in", directory, finished_as), found)
 
 
 def _is_partial(stored: Mapping[str, Any]) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -25,7 +24,7 @@ from splatwizard_core.runs.training_views import training_psnr
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.scene.scene import Scene
-from splatwizard_native import CoreTime, MemoryMeter, synchronize
+from splatwizard_native import CoreTime, MemoryMeter, loading_time, synchronize, work_time
 
 FEWEST_SPEED_VIEWS = 8
 
@@ -66,16 +65,12 @@ def measure(
     renders     folder for the test views as PNG, and in `geometry` what metrics over models show; None: not kept
     """
     plugins, device = session.plugins, session.device
-    began = time.perf_counter()
-    session.load_kernels()  # before everything else, timed apart
-    jit_s = time.perf_counter() - began
-
     meter = MemoryMeter(device)
     meter.start()
-    began = time.perf_counter()
+    began = work_time()
     model, raster, device_bound, static = open_model()
     synchronize(device)
-    open_s = time.perf_counter() - began
+    open_s = work_time() - began
     decoded_bytes, peak_load = meter.current_bytes(), meter.peak_bytes()
     bad_rows = model.check_finite()
     scene = load_scene(resolved.scene_spec, resolved.scene, plugins)
@@ -84,11 +79,11 @@ def measure(
     views = scene.test
 
     meter.start()
-    began = time.perf_counter()
+    began = work_time()
     with torch.no_grad():
         model.prepare()
     synchronize(device)
-    prepare_s = time.perf_counter() - began
+    prepare_s = work_time() - began
     # CUDA's allocator knows all that is held; a resident set only grows by what was measured piece by piece.
     model_bytes = meter.current_bytes() if meter.kind == "cuda" else decoded_bytes + meter.current_bytes()
 
@@ -149,7 +144,7 @@ def measure(
     if report is not None:
         first = speed_views[0].camera
         measured = asdict(report) | {
-            "jit_s": jit_s,
+            "jit_s": loading_time(),
             "prepare_s": prepare_s,
             "load_s": open_s + prepare_s + report.first_frame_s,
             "image_size": [first.width, first.height],

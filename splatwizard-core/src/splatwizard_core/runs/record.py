@@ -101,7 +101,7 @@ class SpeedBlock(Part):
     fps: float
     latency_ms_median: float
     latency_ms_p95: float
-    jit_s: float | None = Field(description="loading or compiling native modules, before everything else")
+    jit_s: float | None = Field(description="loading or compiling native modules; in no other figure")
     prepare_s: float = Field(description="view-independent caches, built once, not in `fps`")
     load_s: float | None = Field(description="from opening the file to the first frame; without `jit_s`")
     frames: int = Field(description="measured, over all repeats")
@@ -176,7 +176,7 @@ class CodecBlock(Part):
     decode_runs_s: list[float]
     decode_spread: SpreadBlock | None
     first_decode_s: float = Field(description="the untimed decode before them: late imports included")
-    jit_s: float | None = Field(description="loading or compiling native modules, before all decodes")
+    jit_s: float | None = Field(description="loading or compiling native modules; in no other figure")
     peak_decode_bytes: int
     memory_kind: Literal["cuda", "rss"]
 

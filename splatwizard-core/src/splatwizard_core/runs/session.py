@@ -13,13 +13,12 @@ from splatwizard_core.errors import SceneError
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.plugins.catalogue import package_of
-from splatwizard_core.plugins.kernels import declared_modules
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.runs.config import ResolvedConfig
-from splatwizard_core.runs.scene_digest import scene_digest
+from splatwizard_core.scene.digest import scene_digest
 from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.scene.scene import Scene
-from splatwizard_native import NativeBuildError, file_sha256, resolve_module
+from splatwizard_native import file_sha256
 
 T = TypeVar("T")
 Role = Literal["trained", "start"]
@@ -90,17 +89,6 @@ class Session:
             self.plugins, device=self.device, prefer=chosen.prefer, forbid=chosen.forbid, suggested=suggested,
             options=chosen.options,
         )  # fmt: skip
-
-    def load_kernels(self) -> None:
-        """Load (or compile) every installed native module now, so that no clock of a step runs while a compiler does.
-
-        One that cannot be built is told once; whoever needs it falls back or says so.
-        """
-        for target in declared_modules(self.plugins):
-            try:
-                resolve_module(target).try_load()
-            except NativeBuildError as error:
-                self.say_once(f"warning: {error}")
 
     def keep(self, role: Role, model: TrainedModel) -> None:
         """Keep one model of each role: the next rate point often wants it again."""

@@ -17,7 +17,7 @@ from splatwizard_core.runs import pretrained
 from splatwizard_core.runs.config import ResolvedConfig
 from splatwizard_core.runs.contention import contention
 from splatwizard_core.runs.directory import CHECKPOINTS, LOG, RunRequest, StepLog, run_directory
-from splatwizard_core.runs.identity import key_in, stored_beside, stored_key, training_identity, training_key
+from splatwizard_core.runs.identity import stored_beside, stored_key, training_identity, training_key
 from splatwizard_core.runs.lock import directory_lock, is_held
 from splatwizard_core.runs.observers import StartedTraining, watched_by
 from splatwizard_core.runs.phases import StageParts
@@ -166,7 +166,12 @@ def _finished(session: Session, directory: Path, key: str) -> dict[str, Any] | N
     facts = StepLog(directory).done(STEP, under)
     if facts is None or "checkpoints" in facts:
         return None
-    return facts if key == under or key_in(session, directory, under) == key else None
+
+    def today() -> str | None:
+        stored = CheckpointStore(directory / CHECKPOINTS).identity()
+        return None if stored is None else stored_key(session.plugins, stored, finished_as=under)
+
+    return facts if key == under or session.once(("key", directory, under), today) == key else None
 
 
 def _folders(parent: Path) -> list[Path]:
@@ -189,7 +194,6 @@ def _train_stages(
 
     Returns the model and the facts that are reported of its training.
     """
-    session.load_kernels()
     resolved, plugins = request.resolved, session.plugins
     scene, ppl = session.scene(resolved), resolved.ppl
     method = pretrained.make_method(plugins, resolved)

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import time
-
 import torch
 
-from splatwizard_native import synchronize
+from splatwizard_native import synchronize, work_time
 
 STAGES = ("pre", "render", "loss", "backward", "post", "optimize")
 """The five stages of a step, the third in its two halves."""
 
 
 class LoopClock:
-    """Wall clock of the loop minus housekeeping: evaluation, checkpoints, logs.
+    """Wall clock of the loop minus housekeeping (evaluation, checkpoints, logs) and the loading of native modules.
 
     seconds     of the loop so far; starts at what an interrupted run had used
     """
@@ -24,11 +22,11 @@ class LoopClock:
 
     @property
     def seconds(self) -> float:
-        return self._seconds + (0.0 if self._since is None else time.perf_counter() - self._since)
+        return self._seconds + (0.0 if self._since is None else work_time() - self._since)
 
     def start(self) -> None:
         """The loop begins, or goes on after housekeeping."""
-        self._since = time.perf_counter()
+        self._since = work_time()
 
     def stop(self) -> None:
         """Housekeeping inside the loop begins, or the loop ends."""
@@ -52,12 +50,12 @@ class StageClock:
         """A step begins."""
         self.last_step = {}
         synchronize(self.device)
-        self._since = time.perf_counter()
+        self._since = work_time()
 
     def mark(self, stage: str) -> None:
         """This stage ends here."""
         synchronize(self.device)
-        now = time.perf_counter()
+        now = work_time()
         self.last_step[stage] = now - self._since
         self.totals[stage] += now - self._since
         self._since = now
