@@ -45,14 +45,14 @@ def test_what_two_threads_load_at_once_counts_once(clock: Clock):
     def other() -> None:
         with work_clock.loading():
             inner_began.set()
-            outer_ended.wait(30)
+            outer_ended.wait(60)
             clock.now += 5
 
     with work_clock.loading():
         clock.now += 10
         thread = threading.Thread(target=other)
         thread.start()
-        inner_began.wait(30)
+        inner_began.wait(60)
         clock.now += 1
     outer_ended.set()
     thread.join()

@@ -1,4 +1,4 @@
-"""What a training is made from: its key, and what a checkpoint says of it, read with the configurations of today.
+"""Keys of trainings, and the identities in checkpoints of any release, read with the configurations of today.
 
 Equal keys mean an interchangeable model. A key is over the values that differ from the defaults, those of methods that
 it is built on too, the version of the method, what the scene holds, and the same of each trained scene that it starts

@@ -1,4 +1,4 @@
-"""What tells two trainings apart: the values of a configuration that differ from its defaults.
+"""Values of a configuration that differ from its defaults: they tell trainings apart.
 
 A new key whose default changes nothing is in no identity, so it leaves finished trainings and cached scenes as they
 are. A changed default is in none either: the block that states it counts the change in `DEFAULTS`, which is.
