@@ -1,4 +1,4 @@
-"""Whether the start decides what HAC, HAC++ and CAT-3DGS reach: rate points x seeds x numbers of starting points.
+"""Measure whether the start decides what HAC, HAC++ and CAT-3DGS reach: rate points x seeds x starting points.
 
     SPLATWIZARD_DATA=DATA python benchmarks/anchor_starts.py out/published --lego nerf_synthetic:PATH/lego --plan
     SPLATWIZARD_DATA=DATA python benchmarks/anchor_starts.py out/published --lego nerf_synthetic:PATH/lego \\

@@ -82,7 +82,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Measured:
-    """What stands beside a row.
+    """Runs that stand beside a row.
 
     runs    at its rate point, a record a seed
     curve   of all rate points with such runs
@@ -231,7 +231,7 @@ def cells(each: Measured, number: int) -> list[str]:
 
 
 def notes(each: Measured, number: int) -> list[str]:
-    """What a reader must know of a row: source, why there is no size at equal PSNR, what differs."""
+    """List what a reader must know of a row: source, why there is no size at equal PSNR, what differs."""
     of, runs = each.row.figure, each.runs
     steps = "" if of.steps is None else f" {of.steps:,} steps;"
     by = "not measured yet"
@@ -246,7 +246,7 @@ def notes(each: Measured, number: int) -> list[str]:
 
 
 def overlaps(found: Sequence[Measured]) -> list[str]:
-    """How much of the published and the measured PSNR range of each method on a scene is shared."""
+    """Tell which share of the published and the measured PSNR range of each method on a scene is common."""
     lines = []
     groups: dict[tuple[str, str], list[Measured]] = {}
     for each in found:

@@ -63,7 +63,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a cell: one of STATES, and why where it failed or its scene is missing."""
+    """End of a cell: one of STATES, and why where it failed or its scene is missing."""
 
     state: str
     why: str = ""
@@ -173,7 +173,7 @@ def run_cells(cells: Sequence[Cell], out: Path, args: argparse.Namespace) -> dic
 
 
 def _why(status: int) -> str:
-    """What the exit status of `sw bench` says of a cell without a record; empty: nothing."""
+    """Tell what the exit status of `sw bench` says of a cell without a record; empty: nothing."""
     told = {0: "", 1: "", INTERRUPTED: "interrupted, the same command goes on"}
     return told.get(status, f"`sw bench` ended with {status}, see above")
 
@@ -199,7 +199,7 @@ def _bench(plan: str, out: Path, args: argparse.Namespace) -> int:
 
 
 def _stamp(cell: Cell, out: Path) -> int | None:
-    """When the record of a cell was written; None: there is none."""
+    """Return the time at which the record of a cell was written; None: there is none."""
     record = cell.directory(out) / "metrics.json"
     return record.stat().st_mtime_ns if record.is_file() else None
 
