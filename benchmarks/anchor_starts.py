@@ -5,7 +5,8 @@
         --gpus 0,1,2,3 --jobs 20
 
 On --scene each method runs at its lowest and its highest rate point with --seeds seeds from the default start, and with
-one seed from each number of --starts random points (the first seed itself where the default is as many); --curves methods run at every rate point with one seed. On --lego
+one seed from each number of --starts random points (the first seed itself where the default is as many); --curves
+methods run at every rate point with one seed. On --lego
 (a small scene, left out where it is not given) the highest rate point alone, with --lego-seeds seeds. The background is
 black, as the authors have it.
 

@@ -14,8 +14,8 @@ AUTHORS_VALUES: Mapping[str, Mapping[str, Any]] = {
 
 BY_DATASET: Mapping[str, Mapping[str, Any]] = {
     **AUTHORS_VALUES,
-    # The authors have no such scenes. Background and cells as HAC has them there; all weights of the rate a tenth, so that
-    # lambda is that of HAC's rate points: an object fills a fraction of the picture, which lowers the distortion alike.
+    # The authors have no such scenes. Background and cells as HAC has them there; all weights of the rate a tenth, so
+    # that lambda is that of HAC's rate points: an object fills a part of the picture, which lowers the distortion, too.
     "nerf_synthetic": {
         "growth.init_factor": 4,
         "background": "black",
