@@ -152,12 +152,13 @@ def test_any_method_finds_it_by_name(plugins):
 
 
 @pytest.mark.cuda
-def test_a_gpu_gives_the_scores_of_the_cpu(plugins, rasterizer, make):
+@pytest.mark.parametrize("kind", ["v_important_score", "v_tile_score"])
+def test_a_gpu_gives_the_scores_of_the_cpu(plugins, rasterizer, make, kind):
     from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 
     model = make.cloud(2000)
     cameras = [make.camera(eye, 320, 240) for eye in ([0.0, 0.0, -4.0], [3.0, 0.5, -3.0])]
-    on_cpu = score(rasterizer, model, cameras)
-    on_gpu = score(NegotiatedRasterizer(plugins, device="cuda"), model.cuda(), cameras)
+    on_cpu = score(rasterizer, model, cameras, kind=kind)
+    on_gpu = score(NegotiatedRasterizer(plugins, device="cuda"), model.cuda(), cameras, kind=kind)
     assert on_gpu.is_cuda
     assert on_gpu.cpu().tolist() == pytest.approx(on_cpu.tolist(), rel=1e-5)
