@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
+from torch import Tensor
 
-from splatwizard_core.api import PointCloud, Protocol, Scene, SceneError, View
+from splatwizard_core.api import Camera, PointCloud, Protocol, Scene, SceneError, View
 from sw_datasets.splits import split_views
 
+FAR_OUT = 100.0
+"""Distance of the cameras from the origin, in sizes of the scene, from which they are moved: float32 coordinates there
+have steps of 1e-5 of the scene, a hundredth of a pixel of a picture of 1600."""
 FARTHEST = 1e6  # pixels: focal lengths and principal points beyond it overflow float32 when they are projected with
 
 
@@ -25,8 +31,10 @@ def assemble_scene(
     ground_truth: dict[str, Any] | None = None,
     warnings: Sequence[str] = (),
 ) -> Scene:
-    """Make a checked scene, split by `protocol.split` over the views sorted by name.
+    """Make a checked scene in float32, split by `protocol.split` over the views sorted by name.
 
+    views, points   may have poses and positions in float64: those far from the origin are moved to a local one, which
+                    the scene keeps (`Scene.origin`)
     own_split   (train, test) that the files themselves define, taken when the split is "file"
 
     Non-finite points are dropped with a warning that counts them. Raises SceneError in one line for a pose that is
@@ -57,7 +65,16 @@ def assemble_scene(
             train, test = split_views(views, protocol.split)
         except SceneError as error:
             raise refused(error) from error
+    origin = local_origin(views, points)
+    if any(origin):
+        notes.append(
+            f"the coordinates lie far from 0: the scene is moved to a local origin at {told(origin)} "
+            "(`sw export --world` moves models back)"
+        )
+    for view in views:
+        view.camera = moved(view.camera, origin)
     if points is not None:
+        points = PointCloud((points.xyz.double() - torch.tensor(origin, dtype=torch.float64)).float(), points.rgb)
         finite = points.finite()
         bad = len(points) - len(finite)
         if bad and bad == len(points):
@@ -65,11 +82,52 @@ def assemble_scene(
         if bad:
             notes.append(f"dropped {bad} of {len(points)} points that are not finite")
         points = finite
-    scene = Scene(name, train, test, points, protocol, path, dict(ground_truth or {}), notes)
+    scene = Scene(name, train, test, points, protocol, path, dict(ground_truth or {}), notes, origin)
     if scene.radius == 0:
         reason = "there is one training camera" if len(train) == 1 else "all training cameras stand at one place"
         notes.append(f"{reason}: the scene extent is set to 1.0, which scales learning rates and thresholds")
     return scene
+
+
+def local_origin(views: Sequence[View], points: PointCloud | None) -> tuple[float, float, float]:
+    """The point of the world that becomes the origin, in whole steps of about the scene's size; 0 for most scenes.
+
+    It follows from the poses of all views, whatever the split, and from the points.
+    """
+    centres = torch.stack([centre_of(view.camera) for view in views])
+    middle = centres.median(dim=0).values
+    size = (centres - middle).norm(dim=1).max().item()
+    if points is not None and len(points):
+        reach = (points.xyz.double() - middle).norm(dim=1)
+        size = max(size, reach[torch.isfinite(reach)].median().item() if torch.isfinite(reach).any() else 0.0)
+    distance = middle.norm().item()
+    if size <= 16 * torch.finfo(views[0].camera.tau.dtype).eps * distance:  # all stand at one place
+        size = 1.0
+    if not math.isfinite(distance) or distance < FAR_OUT * size:
+        return (0.0, 0.0, 0.0)
+    step = 10.0 ** min(math.floor(math.log10(size)), 0)
+    x, y, z = (round(round(value / step) * step, 9) for value in middle.tolist())
+    return (x, y, z)
+
+
+def centre_of(camera: Camera) -> Tensor:
+    """Camera centre in the world, [3] float64."""
+    return -(camera.R.double().T @ camera.tau.double())
+
+
+def moved(camera: Camera, origin: tuple[float, float, float]) -> Camera:
+    """The camera, in float32, of a world whose origin is at `origin` of the old one."""
+    if not any(origin) and camera.tau.dtype == torch.float32:
+        return camera
+    tau = camera.tau.double()
+    if any(origin):
+        tau = tau + camera.R.double() @ torch.tensor(origin, dtype=torch.float64)
+    return replace(camera, R=camera.R.float(), tau=tau.float())
+
+
+def told(origin: tuple[float, float, float]) -> str:
+    """The coordinates in as few digits as say them."""
+    return "(" + ", ".join(f"{value:.12g}" for value in origin) + ")"
 
 
 def _camera_fault(view: View) -> str | None:

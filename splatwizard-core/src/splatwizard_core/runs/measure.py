@@ -22,7 +22,6 @@ from splatwizard_core.runs.environment import describe_environment
 from splatwizard_core.runs.record import MemoryBlock, MetricBlock, SpeedBlock, picked
 from splatwizard_core.runs.session import Session
 from splatwizard_core.scene.camera import Camera
-from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.scene.scene import Scene
 from splatwizard_native import CoreTime, MemoryMeter, synchronize
 
@@ -76,7 +75,7 @@ def measure(
     open_s = time.perf_counter() - began
     decoded_bytes, peak_load = meter.current_bytes(), meter.peak_bytes()
     bad_rows = model.check_finite()
-    scene = load_scene(resolved.scene_spec, resolved.scene, plugins)
+    scene = session.scene(resolved)
     options = quality.render_options(raster, scene.background.to(device))
     rasterizer = session.rasterizer(resolved, quality.suggested_rasterizers(raster))
     views = scene.test
@@ -123,6 +122,8 @@ def measure(
     found = {
         "dataset": scene.protocol.dataset,
         "scene": scene.name,
+        "scene_warnings": list(scene.warnings),
+        "scene_origin": list(scene.origin),
         "protocol": {"id": scene.protocol.id, **asdict(scene.protocol)},
         "train_views": len(scene.train),
         "test_views": len(views),

@@ -58,7 +58,7 @@ def run(session: Session, request: RunRequest) -> tuple[schema.Record, Path]:
             arguments = ["eval", str(encoded), "--config", str(directory / CONFIG), "--device", str(session.device)]
             arguments += ["--renders", str(directory / RENDERS), "--repeats", str(request.repeats), "--quiet", "--json"]
             arguments += ["--geometry"] * request.geometry
-            return {**run_fresh(arguments), "asked": asked}
+            return {**run_fresh(arguments, told=session.told), "asked": asked}
 
         encoding = steps.once(
             "encode", content_hash([train_key, resolved.config_content()]), encode_it,
