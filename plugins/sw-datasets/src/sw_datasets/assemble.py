@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
+import os
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from splatwizard_core.api import Camera, PointCloud, Protocol, Scene, SceneError, View
-from sw_datasets.splits import split_views
+from sw_datasets.name_lists import NameLists, lists_beside, lists_id, read_lists, split_by_lists
+from sw_datasets.splits import is_rule, split_views
 
 FAR_OUT = 100.0
 """Distance of the cameras from the origin, in sizes of the scene, from which they are moved: float32 coordinates there
@@ -28,6 +31,8 @@ def assemble_scene(
     protocol: Protocol,
     path: str | None = None,
     own_split: tuple[Sequence[View], Sequence[View]] | None = None,
+    own_lists: NameLists | None = None,
+    finds_lists: bool = False,
     ground_truth: dict[str, Any] | None = None,
     warnings: Sequence[str] = (),
 ) -> Scene:
@@ -36,6 +41,8 @@ def assemble_scene(
     views, points   may have poses and positions in float64: those far from the origin are moved to a local one, which
                     the scene keeps (`Scene.origin`)
     own_split   (train, test) that the files themselves define, taken when the split is "file"
+    own_lists   names of views in the scene's own files, taken like train.txt and test.txt beside it
+    finds_lists the scene's own lists are taken before `protocol.split`, which the user did not ask for
 
     Non-finite points are dropped with a warning that counts them. Raises SceneError in one line for a pose that is
     not finite (naming the image), equal names, an empty half of the split, and points none of which is finite.
@@ -54,17 +61,32 @@ def assemble_scene(
     repeated = [n for n, count in Counter(v.name for v in views).items() if count > 1]
     if repeated:
         raise refused(f"image name '{repeated[0]}' occurs more than once")
-    if protocol.split == "file":
-        if own_split is None:
-            raise refused("split 'file', but the scene brings no split; use 'every8' or 'all'")
-        train, test = list(own_split[0]), list(own_split[1])
-        if not train or not test:
-            raise refused(f"its own split has {len(train)} views to train and {len(test)} to test; both need 1")
-    else:
-        try:
+    folder = None if path is None else Path(path)
+    try:
+        lists = own_lists
+        if (named := split_file(protocol.split, folder)) is not None:
+            lists = read_lists(named)
+        elif own_split is not None:
+            lists = None
+        elif lists is None and folder is not None and folder.is_dir():
+            lists = lists_beside(folder)
+        if lists is not None and named is None and not finds_lists and protocol.split != "file":
+            notes.append(f"{lists.source} of the scene is not used (split = file takes it)")
+            lists = None
+        if lists is not None:
+            train, test, told_of_lists = split_by_lists(views, lists)
+            notes += told_of_lists
+            protocol = replace(protocol, split=lists_id(train, test))
+        elif protocol.split == "file":
+            if own_split is None:
+                raise SceneError("split 'file', but the scene brings no split; use 'every8', 'all' or a file of names")
+            train, test = list(own_split[0]), list(own_split[1])
+            if not train or not test:
+                raise SceneError(f"its own split has {len(train)} views to train and {len(test)} to test; both need 1")
+        else:
             train, test = split_views(views, protocol.split)
-        except SceneError as error:
-            raise refused(error) from error
+    except SceneError as error:
+        raise refused(error) from error
     origin = local_origin(views, points)
     if any(origin):
         notes.append(
@@ -87,6 +109,14 @@ def assemble_scene(
         reason = "there is one training camera" if len(train) == 1 else "all training cameras stand at one place"
         notes.append(f"{reason}: the scene extent is set to 1.0, which scales learning rates and thresholds")
     return scene
+
+
+def split_file(split: str, scene: Path | None) -> Path | None:
+    """The file of names that a split is, where it is no rule: as it is, or in the scene's folder."""
+    if is_rule(split):
+        return None
+    places = [Path(split).expanduser(), *([scene / split] if scene is not None else [])]
+    return next((place for place in places if os.path.isfile(place)), None)
 
 
 def local_origin(views: Sequence[View], points: PointCloud | None) -> tuple[float, float, float]:

@@ -20,6 +20,7 @@ class Rules:
     asked       named protocol whose pictures are the default
     images      picture folder; None: the layout has none to choose
     masked      pictures are cut out by alpha or mask; None: by alpha, if the family composites it
+    finds_lists lists of names in the scene decide its split, as the user named none and nothing is published
     the rest    as in Protocol
     """
 
@@ -33,6 +34,7 @@ class Rules:
     principal_point: str
     masked: bool | None
     composite8: bool
+    finds_lists: bool = False
 
     @property
     def cuts_alpha(self) -> bool:
@@ -113,6 +115,7 @@ def rules_for(family: Family, folder: str, options: SceneOptions) -> Rules:
         options.principal_point or family.principal_point,
         options.mask_background,
         options.legacy_8bit_composite,
+        finds_lists=options.split is None and options.test_every is None and not family.scenes,
     )
 
 

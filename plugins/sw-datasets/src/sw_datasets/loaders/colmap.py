@@ -110,6 +110,7 @@ def load_colmap(path: Path, rules: Rules, options: SceneOptions, *, masks: MaskF
         protocol=rules.protocol(masked=gate.masked),
         path=str(path),
         warnings=warnings,
+        finds_lists=rules.finds_lists,
     )
 
 

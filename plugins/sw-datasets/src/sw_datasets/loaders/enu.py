@@ -69,6 +69,7 @@ def load_enu(path: Path, rules: Rules, options: SceneOptions) -> Scene:
         protocol=rules.protocol(masked=gate.masked),
         path=str(path),
         warnings=warnings,
+        finds_lists=rules.finds_lists,
     )
 
 

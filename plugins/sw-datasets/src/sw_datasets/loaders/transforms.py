@@ -23,7 +23,8 @@ from sw_datasets.assemble import assemble_scene
 from sw_datasets.families import TRANSFORMS
 from sw_datasets.gate import Gate
 from sw_datasets.loaders.colmap import mask_files
-from sw_datasets.picture_names import SUFFIXES, find_pictures, is_inside, name_key, view_name
+from sw_datasets.name_lists import NameLists
+from sw_datasets.picture_names import SUFFIXES, find_pictures, is_inside, view_name
 from sw_datasets.rules import rules_for, unused_option_warnings
 from sw_datasets.start_points import cloud_beside, points_in_sight, read_cloud
 
@@ -60,13 +61,13 @@ class Frames:
 
     unused      keys that were not used
     points      start points that it names, if it names any and they are there
-    lists       "train", "test", "val" -> names of views, where it has such lists
+    lists       names of views to train and to test, where it has such lists
     """
 
     views: list[View]
     unused: set[str] = field(default_factory=set)
     cloud: Path | None = None
-    lists: dict[str, list[str]] = field(default_factory=dict)
+    lists: NameLists | None = None
     warnings: list[str] = field(default_factory=list)
 
 
@@ -82,7 +83,6 @@ class TransformsDataset:
         rules = rules_for(TRANSFORMS, path.resolve().name, options)
         gate = Gate(path, rules)
         found = read_frames(path, FILE, gate)
-        own_split = split_of_lists(found)
         points, told = start_of(path, found, options)
         warnings = [*found.warnings, *unused_keys(FILE, found.unused), *gate.warnings(), *told]
         unused = ("legacy_8bit_composite",) if found.cloud is None else ("legacy_8bit_composite", "init_points")
@@ -93,8 +93,9 @@ class TransformsDataset:
             points=points,
             protocol=rules.protocol("frames", masked=gate.masked),
             path=str(path),
-            own_split=own_split,
+            own_lists=found.lists,
             warnings=warnings,
+            finds_lists=rules.finds_lists,
         )
 
 
@@ -110,18 +111,6 @@ def start_of(path: Path, found: Frames, options: SceneOptions) -> tuple[PointClo
         f"there are no start points: {options.init_points:,} random ones are laid where the cameras look "
         "(init_points = N)"
     ]
-
-
-def split_of_lists(found: Frames) -> tuple[list[View], list[View]] | None:
-    """(train, test) of the file's own lists of names; None if it has none for both."""
-    if not found.lists.get("train") or not (found.lists.get("test") or found.lists.get("val")):
-        return None
-    by_name = {name_key(view.name): view for view in found.views}
-    train, test = (
-        [by_name[name_key(n)] for n in names if name_key(n) in by_name]
-        for names in (found.lists["train"], found.lists.get("test") or found.lists["val"])
-    )
-    return train, test
 
 
 def unused_keys(file: str, keys: set[str]) -> list[str]:
@@ -161,9 +150,10 @@ def read_frames(path: Path, file: str, gate: Gate) -> Frames:
             f"{contradicted[0]}: the focal length is taken"
         )
     found.cloud = _named_cloud(path, data.get("ply_file_path"), file, found.warnings)
-    for part, key in SPLIT_LISTS.items():
-        if key in data:
-            found.lists[part] = _name_list(data[key], key, where)
+    lists = {part: _name_list(data[key], key, where) for part, key in SPLIT_LISTS.items() if data.get(key)}
+    test = lists.get("test") or lists.get("val")
+    if lists.get("train") and test:
+        found.lists = NameLists(lists["train"], test, file)
     return found
 
 
@@ -190,10 +180,10 @@ def _picture_name(path: Path, frame: Mapping[str, Any], index: int, where: str) 
     return name + ".png" if bare else name
 
 
-def _name_list(names: Any, key: str, where: str) -> list[str]:
+def _name_list(names: Any, key: str, where: str) -> tuple[str, ...]:
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise SceneError(f"{where}: '{key}' must be a list of file names")
-    return names
+    return tuple(names)
 
 
 def _masks(path: Path, frames: list[Any], names: list[str], warnings: list[str]) -> list[Path | None]:
