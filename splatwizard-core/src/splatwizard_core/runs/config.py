@@ -300,8 +300,8 @@ def resolve(
         reading = apply_overrides(reading, given[SceneParams], source=source)
     config = config.completed(plugins, provenance)
     reading_values = reading.model_dump()
-    if reading.split is not None and os.path.isfile(reading.split):
-        reading_values["split"] = os.path.abspath(reading.split)  # for a process with another working directory
+    if reading_values["split"] is not None and os.path.isfile(reading_values["split"]):
+        reading_values["split"] = os.path.abspath(reading_values["split"])  # other processes have other folders
     scene_options = SceneOptions(**reading_values, seed=ppl.seed)
     return ResolvedConfig(
         method.name, preset, rate, scene_spec, config, ppl, scene_options, provenance, init, pretrained,

@@ -21,9 +21,7 @@ class FreshProcessError(SplatwizardError):
     """The other process failed; its own message stands on stderr already."""
 
 
-def run_fresh(
-    arguments: Sequence[str], *, alone_in: Path | None = None, told: Collection[str] = ()
-) -> dict[str, Any]:
+def run_fresh(arguments: Sequence[str], *, alone_in: Path | None = None, told: Collection[str] = ()) -> dict[str, Any]:
     """Run `sw ARGUMENTS` in a new interpreter and return the JSON object that it prints.
 
     alone_in    working directory of one that must not find data sets: what names their folders is not in its

@@ -13,11 +13,12 @@ import torch
 from splatwizard_core.evaluation import evaluate as quality
 from splatwizard_core.evaluation.metrics import MetricSetup, chosen_metrics
 from splatwizard_core.evaluation.speed import SpeedReport, measure_speed
+from splatwizard_core.gaussians.placement import placed_in
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.runs.config import ResolvedConfig
 from splatwizard_core.runs.contention import contention
-from splatwizard_core.runs.decode import import_method, open_model
+from splatwizard_core.runs.decode import import_method, open_model, read_gaussians
 from splatwizard_core.runs.environment import describe_environment
 from splatwizard_core.runs.record import MemoryBlock, MetricBlock, SpeedBlock, picked
 from splatwizard_core.runs.session import Session
@@ -74,8 +75,9 @@ def measure(
     synchronize(device)
     open_s = time.perf_counter() - began
     decoded_bytes, peak_load = meter.current_bytes(), meter.peak_bytes()
-    bad_rows = model.check_finite()
+    bad_rows = model.check_finite() + sum(getattr(model, "origin", {}).get("left_out", {}).values())
     scene = session.scene(resolved)
+    placed_in(model, scene)
     options = quality.render_options(raster, scene.background.to(device))
     rasterizer = session.rasterizer(resolved, quality.suggested_rasterizers(raster))
     views = scene.test
@@ -186,7 +188,7 @@ def opener(path: Path, session: Session) -> Callable[[], Opened]:
 
     def open_file() -> Opened:
         if not encoded:
-            gaussians = session.plugins.read_gaussians(path)
+            gaussians = read_gaussians(path, session.plugins)
             raster = gaussians.origin.get("raster", {})
             return Opened(gaussians.to(session.device).eval().requires_grad_(False), raster)
         model, reader = open_model(path, session.plugins, session.device)
@@ -202,6 +204,7 @@ def open_subject(path: Path, session: Session, resolved: ResolvedConfig, scene: 
     model, raster, _, static = opener(path, session)()
     model.check_finite()
     scene = scene or session.scene(resolved)
+    placed_in(model, scene, path.name)
     rasterizer = session.rasterizer(resolved, quality.suggested_rasterizers(raster))
     with torch.no_grad():
         model.prepare()

@@ -44,7 +44,7 @@ def run(session: Session, request: RunRequest) -> tuple[schema.Record, Path]:
         def encode_it() -> dict[str, Any]:
             trained = train_in(session, request, directory)
             method = make_method(session.plugins, resolved)
-            facts = encode(method, trained.model, trained.facts["raster"], encoded)
+            facts = encode(method, trained.model, trained.facts["raster"], encoded, session.scene(resolved).origin)
             session.say(f"encoded {facts['bytes']:,} bytes in {facts['encode_s']:.2f} s")
             return facts
 
