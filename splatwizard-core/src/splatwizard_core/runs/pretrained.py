@@ -16,10 +16,10 @@ from typing import Any
 
 from splatwizard_core.errors import ConfigError, SplatwizardError, UserInputError
 from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.gaussians.sound import leave_out_senseless
 from splatwizard_core.method import Method
 from splatwizard_core.plugins import PluginManager, load_plugins
 from splatwizard_core.runs.config import INIT, ResolvedConfig, content_hash, resolve
-from splatwizard_core.runs.decode import read_gaussians
 from splatwizard_core.runs.session import Session
 from splatwizard_core.training.keys import field_at, input_files, is_beside_method, value_at
 from splatwizard_core.training.overrides import apply_overrides
@@ -162,7 +162,7 @@ def check_model(path: str) -> GaussianModel:
         if file.read(4) == b"SPWZ":
             raise UserInputError(f"init: {path} is an encoded file: `sw export {path} FILE.ply` makes a .ply of it")
     try:
-        model = read_gaussians(where, load_plugins())
+        model = leave_out_senseless(load_plugins().read_gaussians(where), where.name)
     except SplatwizardError as error:
         reason = str(error).removeprefix(f"{where}: ").removeprefix(f"{where.name}: ")
         raise UserInputError(f"init: {path}: {reason}") from None
