@@ -98,3 +98,17 @@ def test_a_scene_of_one_place_far_out_is_moved_and_told(colmap_folder, load):
     scene = load(root)
     assert any(scene.origin)
     assert any("all training cameras stand at one place" in line for line in scene.warnings)
+
+
+@pytest.mark.parametrize(("scale", "told"), [(1.0, False), (1000.0, False), (0.01, True), (1e-4, True)])
+def test_a_scene_too_small_for_the_near_plane_gets_one_of_its_own(colmap_folder, load, scale, told):
+    model = colmap_folder.model()
+    for key, image in model.images.items():
+        model.images[key] = replace(image, tvec=tuple(scale * x for x in image.tvec))
+    model.points.xyz[:] *= scale
+    root = colmap_folder.write()
+    write_model(model, root / "sparse" / "0")
+    scene = load(root)
+    assert any("the near plane is moved to" in line for line in scene.warnings) == told
+    near = scene.train[0].camera.near
+    assert near == (pytest.approx(0.02 * 5 * scale) if told else 0.2)

@@ -97,3 +97,75 @@ def test_transforms_with_absolute_names_are_read(tmp_path, load):
     (root / "transforms.json").write_text(json.dumps({"fl_x": 30, "frames": frames}))
     scene = load(root)
     assert [view.name for view in scene.test] == ["images/0.png", "images/8.png"]
+
+
+def test_masks_are_found_in_either_unicode_form(colmap_folder, load):
+    colmap_folder.names = [f"caf\u00e9_{i}.png" for i in range(4)]
+    root = colmap_folder.write()
+    (root / "masks").mkdir()
+    for name in colmap_folder.names:
+        Image.new("L", (32, 24)).save(root / "masks" / unicodedata.normalize("NFD", name))
+    assert load(root, mask_background=True).train[0].image().max() == 0
+
+
+@pytest.mark.parametrize(
+    "place", ["sparse/1", "sparse/12", "colmap/sparse/0", "colmap/sparse", "dense/0/sparse", "dense/sparse"]
+)
+@pytest.mark.parametrize("text", [True, False])
+def test_models_elsewhere_are_read(colmap_folder, load, place, text):
+    colmap_folder.sparse, colmap_folder.text = place, text
+    if place.startswith("dense/"):
+        colmap_folder.pictures = f"{place.removesuffix('/sparse')}/images"
+    scene = load(colmap_folder.write())
+    assert len(scene.train) + len(scene.test) == 10
+
+
+def test_of_several_models_the_largest_is_read_unless_one_is_the_first(colmap_folder, load):
+    colmap_folder.sparse = "sparse/2"
+    root = colmap_folder.write()
+    colmap_folder.sparse, colmap_folder.names = "sparse/1", colmap_folder.names[:3]
+    colmap_folder.write()
+    scene = load(root)
+    assert len(scene.train) + len(scene.test) == 10
+    assert any(
+        "the model in sparse/2 is read (10 images); there is also sparse/1 (3 images)" in w for w in scene.warnings
+    )
+    colmap_folder.sparse = "sparse/0"
+    colmap_folder.write()
+    scene = load(root)
+    assert len(scene.train) + len(scene.test) == 3
+    assert any("there is also sparse/1 (3 images), sparse/2 (10 images)" in w for w in scene.warnings)
+
+
+def test_points_of_a_ply_serve_where_the_model_has_none(colmap_folder, load):
+    colmap_folder.num_points = 0
+    root = colmap_folder.write()
+    random = load(root, init_points=50)
+    assert len(random.points) == 50
+    assert any("50 random ones are laid where the cameras look" in line for line in random.warnings)
+    (root / "sparse" / "0" / "points3D.bin").unlink()
+    assert len(load(root, init_points=50).points) == 50
+    (root / "sparse" / "0" / "points3D.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+        "1 2 3\n4 5 6\n"
+    )
+    assert load(root).points.xyz.tolist() == [[1, 2, 3], [4, 5, 6]]
+
+
+def test_many_frames_of_few_pictures_and_endless_names_are_one_short_line_at_once(tmp_path, load):
+    import time
+
+    (tmp_path / "images").mkdir()
+    Image.new("RGB", (32, 24)).save(tmp_path / "images" / "0.png")
+    matrix = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]
+    frames = [{"file_path": "images/0.png", "transform_matrix": matrix}] * 100_000
+    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 30, "frames": frames}))
+    began = time.perf_counter()
+    with pytest.raises(SceneError, match="occurs more than once"):
+        load(tmp_path)
+    assert time.perf_counter() - began < 5
+    frames = [{"file_path": "x" * 60_000, "transform_matrix": matrix}]
+    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 30, "frames": frames}))
+    with pytest.raises(SceneError) as caught:
+        load(tmp_path)
+    assert len(str(caught.value)) < 500

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import unicodedata
+from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path, PurePosixPath
@@ -12,6 +13,9 @@ from pathlib import Path, PurePosixPath
 from splatwizard_core.api import SceneError
 
 SUFFIXES = frozenset((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"))
+
+LONGEST_TOLD = 120
+"""Characters of a name in a message."""
 
 
 def is_inside(name: str) -> bool:
@@ -55,19 +59,27 @@ def find_pictures(folder: Path, names: Sequence[str], notes: list[str] | None = 
     there = _Files(folder)
     found: list[Path] = []
     missing: list[str] = []
+    of: dict[str, str | None] = {}
     for name in names:
-        file = there.of(name)
+        if name not in of:
+            of[name] = there.of(name)
+        file = of[name]
         if file is not None:
             found.append(folder / file)
         elif is_inside(name) or _is_foreign(name):
             missing.append(name)
         else:
             raise SceneError(
-                f"image name {name!r} leads out of {folder}; the scene files are damaged", path=str(folder)
+                f"image name {short(name)} leads out of {folder}; the scene files are damaged", path=str(folder)
             )
     if missing:
-        first = ", ".join(repr(name) for name in missing[:5]) + (", ..." if len(missing) > 5 else "")
+        first = ", ".join(map(short, missing[:5])) + (", ..." if len(missing) > 5 else "")
         raise SceneError(f"{folder}: {len(missing)} of {len(names)} images are missing: {first}", path=str(folder))
+    if repeated := [name for name, count in Counter(names).items() if count > 1]:
+        raise SceneError(
+            f"{folder}: image name {short(repeated[0])} occurs more than once ({len(repeated)} of this kind)",
+            path=str(folder),
+        )
     served: dict[Path, str] = {}
     for name, path in zip(names, found, strict=True):
         if served.setdefault(path, name) != name:
@@ -78,6 +90,11 @@ def find_pictures(folder: Path, names: Sequence[str], notes: list[str] | None = 
     if notes is not None:
         notes += there.notes()
     return found
+
+
+def short(name: str) -> str:
+    """A stranger's name as it stands in a message: printable, and no longer than a line."""
+    return repr(name) if len(name) <= LONGEST_TOLD else f"{name[:LONGEST_TOLD]!r}..."
 
 
 def view_name(name: str, file: Path, folder: Path) -> str:

@@ -49,9 +49,7 @@ def load_blender(path: Path, rules: Rules, options: SceneOptions) -> Scene:
     elif rules.split == "file" and options.split is None:
         rules = replace(rules, split="every8")
         warnings.append(f"there is no transforms_test.json: the training views are split by {rules.split}")
-    unused = train.unused | test.unused
-    if rules.family.scenes:
-        unused -= {"rotation"}  # of the camera between two frames: in every file of the collection
+    unused = (train.unused | test.unused) - {"rotation"}  # Blender's: the turn of the camera between two frames
     warnings += unused_keys("transforms_train.json", unused)
     published, views = rules.family.views, (len(train.views), len(test.views))
     if rules.scene is not None and published is not None and views != published:

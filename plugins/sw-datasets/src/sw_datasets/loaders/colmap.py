@@ -15,7 +15,7 @@ from sw_datasets.assemble import assemble_scene
 from sw_datasets.families import COLMAP
 from sw_datasets.gate import Gate
 from sw_datasets.loaders.colmap_model import ColmapCamera, ColmapImage, ColmapPoints, count_images, read_model
-from sw_datasets.picture_names import find_pictures, list_pictures, view_name
+from sw_datasets.picture_names import find_pictures, list_pictures, name_key, view_name
 from sw_datasets.rules import Rules, rules_for, unused_option_warnings
 from sw_datasets.start_points import cloud_beside, points_in_sight, read_cloud
 
@@ -34,6 +34,9 @@ PANORAMAS = ("EQUIRECTANGULAR",)
 MAX_SIDE = 1 << 24
 """Pixels; wider is a damaged file (text may state any integer, also one that no float can hold)."""
 
+
+ELSEWHERE = ("colmap/sparse/0", "colmap/sparse", "dense/0/sparse", "dense/sparse")
+"""Folders of models that are not where COLMAP's mapper puts them."""
 
 MaskFinder = Callable[[Path, Sequence[str]], "list[Path | None]"]
 """(scene folder, image names) -> the mask file of each image, None where there is none."""
@@ -70,13 +73,14 @@ def load_colmap(path: Path, rules: Rules, options: SceneOptions, *, masks: MaskF
     if not images:
         raise SceneError(f"{folder}: no registered image; a scene needs at least 2", path=str(path))
     warnings = _other_models(path, folder)
-    where, names = _existing(path, picture_folder), [image.name for image in images]
+    root = picture_root(path, folder, picture_folder)
+    where, names = _existing(root, picture_folder), [image.name for image in images]
     files = find_pictures(where, names, warnings)
     warnings += _unused(where, len(images))
     names = [view_name(name, file, where) for name, file in zip(names, files, strict=True)]
     gate = Gate(path, rules, quiet_masks=masks is not None)
     views = []
-    for image, name, file, mask in zip(images, names, files, (masks or mask_files)(path, names), strict=True):
+    for image, name, file, mask in zip(images, names, files, (masks or mask_files)(root, names), strict=True):
         if image.camera_id not in model.cameras:
             raise SceneError(
                 f"{folder}: image '{name}' refers to camera {image.camera_id}, which is not in cameras",
@@ -117,13 +121,21 @@ def load_colmap(path: Path, rules: Rules, options: SceneOptions, *, masks: MaskF
 def model_folder(path: Path) -> Path | None:
     """The folder of the model below `path`; None if there is none.
 
-    sparse/0 or sparse, where COLMAP puts it; else colmap/sparse/0 or colmap/sparse (nerfstudio); else that of
-    sparse/1, sparse/2, ... with the most images.
+    sparse/0 or sparse, where COLMAP puts it; else that of sparse/1, sparse/2, ... with the most images; else
+    colmap/sparse/0 or colmap/sparse (nerfstudio), dense/0/sparse or dense/sparse (COLMAP's undistorted copy).
     """
-    for folder in (path / "sparse" / "0", path / "sparse", *(path / "colmap" / "sparse" / x for x in ("0", ""))):
+    usual = [path / "sparse" / "0", path / "sparse"]
+    numbered = sorted(_numbered(path / "sparse"), key=count_images, reverse=True)
+    for folder in (*usual, *numbered, *(path / place for place in ELSEWHERE)):
         if _has(folder, "cameras"):
             return folder
-    return max(_numbered(path / "sparse"), key=count_images, default=None)
+    return None
+
+
+def picture_root(path: Path, model: Path, pictures: str) -> Path:
+    """The folder in which the picture folder lies: the scene, or where a copy has its own, the copy."""
+    own = model.parent if model.name == "sparse" else model.parent.parent
+    return own if own != path and (own / pictures).is_dir() and not (path / pictures).is_dir() else path
 
 
 def _numbered(sparse: Path) -> list[Path]:
@@ -199,11 +211,11 @@ def mask_files(path: Path, names: Sequence[str]) -> list[Path | None]:
     folder = next((path / name for name in ("masks", "mask") if (path / name).is_dir()), None)
     if folder is None:
         return [None] * len(names)
+    there = {name_key(mask): folder / mask for mask in list_pictures(folder)}
     found: list[Path | None] = []
-    for name in names:
-        stem = os.path.splitext(name)[0]
-        candidates = (folder / f"{name}.png", folder / name, folder / f"{stem}.png")
-        found.append(next((file for file in candidates if os.path.isfile(file)), None))
+    for name in map(name_key, names):
+        candidates = (f"{name}.png", name, f"{os.path.splitext(name)[0]}.png")
+        found.append(next((there[mask] for mask in candidates if mask in there), None))
     return found
 
 

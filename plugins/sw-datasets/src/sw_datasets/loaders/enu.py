@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from splatwizard_core.api import Camera, Scene, SceneError, SceneOptions
 from sw_datasets.assemble import assemble_scene
 from sw_datasets.gate import Gate
+from sw_datasets.loaders.transforms import unused_keys
 from sw_datasets.picture_names import list_pictures
 from sw_datasets.rules import Rules, unused_option_warnings
 from sw_datasets.start_points import points_in_sight
@@ -37,7 +38,7 @@ def load_enu(path: Path, rules: Rules, options: SceneOptions) -> Scene:
     if not folder.is_dir():
         raise SceneError(f"{path}: the picture folder '{folder.name}' is missing", path=str(path))
     names = list_pictures(folder)
-    rows = read_poses(path / POSES)
+    rows, others = read_poses(path / POSES)
     if len(rows) != len(names):
         raise SceneError(
             f"{path}: {POSES} has {len(rows)} poses, {folder.name} has {len(names)} pictures; both must match",
@@ -60,7 +61,7 @@ def load_enu(path: Path, rules: Rules, options: SceneOptions) -> Scene:
         f"{POSES} brings no points: {options.init_points:,} random ones are laid where the cameras look, "
         "figures are not comparable with those of the COLMAP layout"
     ]
-    warnings += gate.warnings()
+    warnings += [*unused_keys(POSES, others), *gate.warnings()]
     warnings += unused_option_warnings(options, ("principal_point", "legacy_8bit_composite"), rules.family)
     return assemble_scene(
         path.resolve().name,
@@ -73,8 +74,8 @@ def load_enu(path: Path, rules: Rules, options: SceneOptions) -> Scene:
     )
 
 
-def read_poses(path: Path) -> NDArray[np.float64]:
-    """[N,3,5] float64: camera-to-world rotation, position, and (height, width, focal length) as last column.
+def read_poses(path: Path) -> tuple[NDArray[np.float64], set[str]]:
+    """[N,3,5] float64: camera-to-world rotation, position, (height, width, focal length) as last column; other keys.
 
     Raises SceneError for what is no such file.
     """
@@ -92,7 +93,7 @@ def read_poses(path: Path) -> NDArray[np.float64]:
     if not np.isfinite(rows[:, :15]).all():
         bad = int(np.flatnonzero(~np.isfinite(rows[:, :15]).all(axis=1))[0])
         raise SceneError(f"{path}: the pose in row {bad} is not finite (NaN or infinite)", path=str(path))
-    return rows[:, :15].reshape(-1, 3, 5)
+    return rows[:, :15].reshape(-1, 3, 5), {str(key) for key in content} - {"poses"}
 
 
 def rotations(axes: NDArray[np.float64], path: Path) -> NDArray[np.float64]:
