@@ -16,7 +16,7 @@ MODULES = {
     "runs.record": "Record read_record SCHEMA FILE_NAME",
     "runs.observers": "FinishedRun FinishedRuns StartedTraining TrainingObserver",
     "runs.lock": "directory_lock",
-    "runs.config": "ResolvedConfig resolve",
+    "runs.config": "ResolvedConfig parse_toml resolve",
     "runs.directory": "OWN_FILES RunRequest run_directory",
     "runs.pretrained": "base_config first_scene make_method named_scenes useful_starts",
     "runs.training": "cached_directory",
