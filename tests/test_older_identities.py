@@ -28,13 +28,18 @@ CASES = [
 ]
 
 
+PIXELS = "v_important_score"
+SINCE = {("lightgaussian", "paper"): {"prune.settings.kind": PIXELS, "score.settings.kind": PIXELS}}
+"""Values of then in presets that have others since."""
+
+
 @pytest.fixture(scope="module")
 def session() -> Session:
     return Session(load_plugins(), torch.device("cpu"), print)
 
 
 def asked(name: str, case: dict[str, Any], **sets: Any) -> ResolvedConfig:
-    values = {**case["sets"], **sets}
+    values = {**SINCE.get((name, case["preset"]), {}), **case["sets"], **sets}
     return resolve(load_plugins().methods.load(name), case["preset"], sets=values, scene="demo:tiny")
 
 

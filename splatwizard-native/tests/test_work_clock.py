@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-
 import pytest
 
 from splatwizard_native import loading_time, work_clock, work_time
@@ -32,31 +30,9 @@ def test_it_goes_with_the_wall_clock_but_for_loading(clock: Clock):
     clock.now += 2
     with work_clock.loading():
         clock.now += 30
-        assert work_time() - began == 2  # for another thread that looks meanwhile
-        assert loading_time() == 30
     clock.now += 1
     assert work_time() - began == 3
     assert loading_time() == 30
-
-
-def test_what_two_threads_load_at_once_counts_once(clock: Clock):
-    outer_ended, inner_began = threading.Event(), threading.Event()
-
-    def other() -> None:
-        with work_clock.loading():
-            inner_began.set()
-            outer_ended.wait(60)
-            clock.now += 5
-
-    with work_clock.loading():
-        clock.now += 10
-        thread = threading.Thread(target=other)
-        thread.start()
-        inner_began.wait(60)
-        clock.now += 1
-    outer_ended.set()
-    thread.join()
-    assert loading_time() == 16
 
 
 def test_loading_that_fails_counts_too(clock: Clock):

@@ -19,12 +19,12 @@ from splatwizard_core.cli.main import main
 from splatwizard_core.errors import CheckpointError, SceneError
 from splatwizard_core.method import Method
 from splatwizard_core.plugins import PluginManager
+from splatwizard_core.plugins.versions import changes, installed
 from splatwizard_core.runs import run as run_module
 from splatwizard_core.runs.config import parse_set, read_config_file, resolve
 from splatwizard_core.runs.directory import RunRequest, StepLog, run_directory
 from splatwizard_core.runs.run import run, train_only
 from splatwizard_core.runs.session import Session
-from splatwizard_core.runs.versions import changes, installed
 from splatwizard_core.scene.dataset import SceneOptions
 from splatwizard_core.scene.digest import digests_of, picture_files, scene_digest
 from splatwizard_core.scene.loading import load_scene

@@ -10,7 +10,7 @@ from splatwizard_core.coding.requirements import requirement_of
 from splatwizard_core.errors import PluginError
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.plugins.catalogue import CORE, catalogue, is_ours, normal_name
-from splatwizard_core.runs.versions import installed
+from splatwizard_core.plugins.versions import installed
 
 
 def missing_parts(reader: ContainerReader, plugins: PluginManager) -> list[tuple[str, str]]:

@@ -9,7 +9,6 @@ whatever has become of keys and defaults since.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +28,8 @@ from splatwizard_core.training.params import PipelineParams, SceneParams
 
 FORMAT = 3  # raised when checkpoints come to say something else of what they were made from
 ALL_VALUES = 3  # first format with all values; those before left out keys that were at their defaults
+FORMER_SCENE = {"principal_point": "center", "mask_background": False}
+"""Options of reading a scene -> their defaults until 0.2; what they come to stands in the protocol, which counts."""
 KEY = "key"  # of the training, as the release that made it had it
 _NOT_OF_TODAY = (SplatwizardError, ValidationError, KeyError, TypeError, ValueError)
 BEFORE, BORROWED = "starts from", "built on"
@@ -60,22 +61,24 @@ def _content(session: Session, resolved: ResolvedConfig, *, all_values: bool) ->
             before[name] = {"file": f"sha256 {session.file_digest(Path(resolved.init))}"}
         else:
             before[name] = _content(session, base_config(session.plugins, name, resolved), all_values=all_values)
-    content = resolved.training_values() if all_values else resolved.training_content()
-    borrowed = _borrowed(method, resolved, all_values=all_values)
-    return {**content, "method_version": type(method).version, **_named({BORROWED: borrowed, BEFORE: before})}
+    content = _values(resolved, all_values=all_values)
+    named = _named({BORROWED: _borrowed(method), BEFORE: before})
+    return {**content, "method_version": type(method).version, **named}
 
 
-def _borrowed(method: Method, resolved: ResolvedConfig, *, all_values: bool) -> dict[str, Any]:
-    """Return what a training depends on of the methods that its stages are built on, and of those that these are."""
-    found: dict[str, Any] = {}
-    for other in method.borrows():
-        its = replace(
-            resolved, method=other.name, config=other.config, given=given_values(other.config, method.plugins)
-        )
-        content = its.training_values() if all_values else its.training_content()
-        inner = _borrowed(other, its, all_values=all_values)
-        found[other.name] = {"config": content["config"], **_named({BORROWED: inner})}
-    return found
+def _values(resolved: ResolvedConfig, *, all_values: bool) -> dict[str, Any]:
+    if all_values:
+        return resolved.training_values()
+    content = resolved.training_content()
+    return {**content, "scene": {k: v for k, v in content["scene"].items() if k not in FORMER_SCENE}}
+
+
+def _borrowed(method: Method) -> dict[str, Any]:
+    """Return the given values of the methods that the stages are built on, and of those that these are built on."""
+    return {
+        other.name: {"config": given_values(other.config, other.plugins), **_named({BORROWED: _borrowed(other)})}
+        for other in method.borrows()
+    }
 
 
 def _named(blocks: Mapping[str, Any]) -> dict[str, Any]:
@@ -91,6 +94,8 @@ def stored_config(plugins: PluginManager, stored: Mapping[str, Any], *, absent: 
     """
     cls = plugins.methods.load(stored["method"])
     config, ppl, scene = cls.Config(), stored["pipeline"], dict(stored["scene"])
+    if absent:
+        scene = {key: value for key, value in scene.items() if key not in FORMER_SCENE or value != FORMER_SCENE[key]}
     values = {**(cls.Config.ABSENT if absent else {}), **flatten(cls.Config, stored["config"])}
     values = dict(config.spelled(values))
     content = config.model_dump()
@@ -164,24 +169,12 @@ def _today(plugins: PluginManager, stored: Mapping[str, Any], partial: bool, *, 
     if "file" in stored:
         return dict(stored)
     resolved = stored_config(plugins, stored, absent=partial)
-    content = resolved.training_values() if all_values else resolved.training_content()
+    content = _values(resolved, all_values=all_values)
     before = {
         name: _today(plugins, inner, partial, all_values=all_values) for name, inner in stored.get(BEFORE, {}).items()
     }
-    if partial:  # it does not tell what it was built on, which follows from its values
-        borrowed = _borrowed(make_method(plugins, resolved), resolved, all_values=all_values)
-    else:
-        borrowed = _borrowed_today(plugins, stored, all_values=all_values)
+    # Until format 2 it does not tell what it was built on, which follows from its values.
+    borrowed = _borrowed(make_method(plugins, resolved)) if partial else stored.get(BORROWED, {})
     beside = {k: v for k, v in stored.items() if k not in _PARTS and all_values}
     version = {"method_version": stored["method_version"]}
     return {**beside, **content, **version, **_named({BORROWED: borrowed, BEFORE: before})}
-
-
-def _borrowed_today(plugins: PluginManager, stored: Mapping[str, Any], *, all_values: bool) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for name, inner in stored.get(BORROWED, {}).items():
-        its = stored_config(plugins, {"method": name, "pipeline": {}, "scene": {}, **inner})
-        content = its.training_values() if all_values else its.training_content()
-        deeper = _borrowed_today(plugins, inner, all_values=all_values)
-        found[name] = {"config": content["config"], **_named({BORROWED: deeper})}
-    return found

@@ -14,6 +14,7 @@ from typing import Any
 
 from splatwizard_core.errors import SplatwizardError, UserInputError
 from splatwizard_core.evaluation.metrics import MetricSetup, chosen_metrics, metric_identities
+from splatwizard_core.plugins.versions import changes, installed, providers
 from splatwizard_core.runs import record as schema
 from splatwizard_core.runs.config import ResolvedConfig, content_hash
 from splatwizard_core.runs.contention import CONTENDED, contended_phases
@@ -27,7 +28,6 @@ from splatwizard_core.runs.pretrained import make_method
 from splatwizard_core.runs.session import Session, TrainedModel
 from splatwizard_core.runs.training import total_seconds, train
 from splatwizard_core.runs.training_views import collapse_warning
-from splatwizard_core.runs.versions import changes, installed, providers
 from splatwizard_native import file_sha256
 
 MEASURING = 2  # raised when `sw decode` and `sw eval` come to report more: a step that reported less is done again
@@ -46,8 +46,8 @@ def run(session: Session, request: RunRequest) -> tuple[schema.Record, Path]:
         def encode_it() -> dict[str, Any]:
             trained = train_in(session, request, directory)
             method = make_method(session.plugins, resolved)
-            deterministic = resolved.ppl.deterministic
-            facts = encode(method, trained.model, trained.facts["raster"], encoded, deterministic=deterministic)
+            raster, origin = trained.facts["raster"], session.scene(resolved).origin
+            facts = encode(method, trained.model, raster, encoded, origin, deterministic=resolved.ppl.deterministic)
             session.say(f"encoded {facts['bytes']:,} bytes in {facts['encode_s']:.2f} s")
             return facts
 
@@ -61,7 +61,7 @@ def run(session: Session, request: RunRequest) -> tuple[schema.Record, Path]:
             arguments = ["eval", str(encoded), "--config", str(directory / CONFIG), "--device", str(session.device)]
             arguments += ["--renders", str(directory / RENDERS), "--repeats", str(request.repeats), "--quiet", "--json"]
             arguments += ["--geometry"] * request.geometry
-            return {**run_fresh(arguments), "asked": asked}
+            return {**run_fresh(arguments, told=session.told), "asked": asked}
 
         encoding = steps.once(
             "encode", content_hash([train_key, resolved.config_content()]), encode_it,

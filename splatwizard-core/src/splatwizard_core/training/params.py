@@ -129,7 +129,9 @@ class OptimizationParams(Params):
     ENCODING: ClassVar[tuple[str, ...]] = ("codec",)
     ABSENT: ClassVar[Mapping[str, Any]] = {}
 
-    iterations: int = Field(30_000, ge=1, description="steps; plans keep their ranges, tasks past the end never fire")
+    iterations: int = Field(
+        30_000, ge=1, le=1_000_000_000, description="steps; plans keep their ranges, tasks past the end never fire"
+    )
     scale_schedule: bool = Field(
         False, description="multiply plan bounds, intervals and lr max_steps by iterations / those of a full run"
     )

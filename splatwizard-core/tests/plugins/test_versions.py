@@ -5,9 +5,9 @@ from types import SimpleNamespace
 
 import pytest
 
+from splatwizard_core.plugins import versions
 from splatwizard_core.plugins.registry import Entry
-from splatwizard_core.runs import versions
-from splatwizard_core.runs.versions import changes, made_by
+from splatwizard_core.plugins.versions import changes, made_by
 
 REQUIRED = {
     "sw-method": ["splatwizard-core>=0.2", "sw-family>=0.2", "numpy", "sw-extra; extra == 'all'"],
