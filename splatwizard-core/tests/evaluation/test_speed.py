@@ -20,7 +20,7 @@ class ClockedRenderer:
         self.seconds, self.first, self.now = seconds, first, 0.0
         self.took: list[float] = []
         self.seen: list[int] = []
-        monkeypatch.setattr(speed.time, "perf_counter", lambda: self.now)
+        monkeypatch.setattr(speed, "work_time", lambda: self.now)
 
     def __call__(self, view: int) -> torch.Tensor:
         drawn = len(self.took)
@@ -149,7 +149,7 @@ class FakeGpu:
         self.now = self.busy_until = 0.0
         self.frames = self.synchronized = self.resets = 0
         self.frames_at_reset: list[int] = []
-        monkeypatch.setattr(speed.time, "perf_counter", lambda: self.now)
+        monkeypatch.setattr(speed, "work_time", lambda: self.now)
         monkeypatch.setattr(torch.cuda, "synchronize", self.synchronize)
         monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", self.reset)
         monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda device: 1000 + self.frames)

@@ -166,7 +166,7 @@ def one_thread():
 def now(monkeypatch):
     """The clock of a training, `now[0]` in seconds: it stands still until a test moves it."""
     now = [0.0]
-    monkeypatch.setattr(timing, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    monkeypatch.setattr(timing, "work_time", lambda: now[0])
     return now
 
 
