@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from splatwizard_core.api import BitstreamError, UserInputError
+from splatwizard_core.api import BitstreamError, UserInputError, beyond_limit
 from sw_interchange.bands import COEFFICIENTS, Array
 from sw_interchange.frames import in_frame
 
@@ -25,7 +25,7 @@ SMALLEST_SCALE, LARGEST_SCALE = np.float32(-87.33), np.float32(88.72)
 
 @dataclass(frozen=True)
 class Limits:
-    """Bounds on what a file may make a reader allocate.
+    """Bounds on what a file may make a reader allocate, besides those by the size of the file.
 
     max_gaussians       rows
     max_output_bytes    of all that is decompressed from it
@@ -34,12 +34,19 @@ class Limits:
     max_gaussians: int = 1 << 27
     max_output_bytes: int = 16 << 30
 
-    def check(self, count: int, decoded_bytes: int, name: str) -> None:
-        """Raise BitstreamError if a file claims more."""
+    def check(self, count: int, decoded_bytes: int, size: int, name: str) -> None:
+        """Raise BitstreamError if a file of `size` bytes claims more, or more than so few bytes may stand for."""
         if count > self.max_gaussians:
             raise BitstreamError(f"{name}: claims {count:,} Gaussians, more than the limit of {self.max_gaussians:,}")
         if decoded_bytes > self.max_output_bytes:
             raise BitstreamError(f"{name}: decodes to {decoded_bytes:,} bytes, the limit is {self.max_output_bytes:,}")
+        if (reason := beyond_limit(decoded_bytes, size)) is not None:
+            raise BitstreamError(f"{name}: claims {count:,} Gaussians of {reason}")
+
+
+def decoded_bytes(count: int, coefficients: int) -> int:
+    """Bytes of Gaussians as float32, with so many SH coefficients a channel besides that of band 0."""
+    return count * (56 + 12 * coefficients)
 
 
 @dataclass
