@@ -20,7 +20,7 @@ from splatwizard_core.errors import PluginError, TaskError
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.plugins.catalogue import package_of
 from splatwizard_core.plugins.origins import Origins
-from splatwizard_native import FULL, DiskFullError, ForeseenError
+from splatwizard_native import FULL, DiskFullError, ForeseenError, shortened
 
 if TYPE_CHECKING:
     from splatwizard_core.plugins import Entry
@@ -172,4 +172,4 @@ def _culprit(error: BaseException, arguments: Sequence[str]) -> str:
 
 def _say(text: str) -> None:
     with contextlib.suppress(OSError):  # nobody reads it: the exit status must do
-        print(without_orders(text), file=sys.stderr, flush=True)
+        print(without_orders(shortened(text)), file=sys.stderr, flush=True)
