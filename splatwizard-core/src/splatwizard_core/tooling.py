@@ -30,6 +30,7 @@ MODULES = {
     "training.pipeline": "TrainingRun TrainingStopped",
     "training.scheduler": "build_schedulers",
     "training.params": "SceneParams",
+    "training.toml_file": "read_toml",
     "coding.limits": "decoded_limit",
     "evaluation.evaluate": "png_names render_options render_view save_png suggested_rasterizers",
     "evaluation.metrics": "MetricInfo short_reason",

@@ -78,6 +78,7 @@ from splatwizard_core.training.params import SceneParams as SceneParams
 from splatwizard_core.training.pipeline import TrainingRun as TrainingRun
 from splatwizard_core.training.pipeline import TrainingStopped as TrainingStopped
 from splatwizard_core.training.scheduler import build_schedulers as build_schedulers
+from splatwizard_core.training.toml_file import read_toml as read_toml
 from splatwizard_native.files import bytes_with_named as bytes_with_named
 from splatwizard_native.files import file_sha256 as file_sha256
 from splatwizard_native.files import new_folder as new_folder

@@ -73,7 +73,10 @@ MODULES = {
     "core_time": "CoreTime",
     "cores": "available_cores",
     "cuda_toolkit": "find_nvcc nvcc_version",
-    "errors": "FULL CompilerMissingError DeviceMemoryError DiskFullError ForeseenError NativeBuildError out_of_memory shortened",
+    "errors": (
+        "FULL CompilerMissingError DeviceMemoryError DiskFullError ForeseenError NativeBuildError out_of_memory "
+        "shortened"
+    ),
     "files": (
         "TEMPORARY bytes_with_named file_sha256 naming_full_disk new_folder remove_folder replacing scratch_folder "
         "sweep write_atomic write_json"

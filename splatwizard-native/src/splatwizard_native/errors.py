@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import re
 
-
 MAX_WORD, MAX_MESSAGE = 1000, 8000
 """Characters of a word and of a message that are shown whole; no path that a system takes by name is much longer."""
 

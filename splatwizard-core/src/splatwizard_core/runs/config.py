@@ -6,7 +6,6 @@ import functools
 import hashlib
 import json
 import os
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,15 +20,11 @@ from splatwizard_core.scene.locate import is_procedural
 from splatwizard_core.training.keys import block_keys, dotted, field_at, flatten, input_files, set_at, value_at
 from splatwizard_core.training.overrides import apply_overrides, unknown_key
 from splatwizard_core.training.params import OptimizationParams, Params, PipelineParams, SceneParams
+from splatwizard_core.training.toml_file import read_toml
 from splatwizard_native import file_sha256
 
 if TYPE_CHECKING:
     from splatwizard_core.method import Method
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 __all__ = ["ResolvedConfig", "apply_overrides", "parse_set", "rate_points", "read_config_file", "resolve"]
 
@@ -204,13 +199,7 @@ def rate_points(method: type[Method], asked: str) -> list[str]:
 
 def read_config_file(path: str | Path) -> dict[str, Any]:
     """Read the tables of a TOML file, its names checked. Raises ConfigError that names the line or the key."""
-    try:
-        with open(path, "rb") as file:
-            tables: dict[str, Any] = tomllib.load(file)
-    except OSError as error:
-        raise ConfigError(f"cannot read --config {path}: {error.strerror or error}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} is not valid TOML: {error}") from error
+    tables, _ = read_toml(path, "--config")
     for name in RESERVED:
         value = tables.get(name, "a name")
         if not isinstance(value, str) or not value.strip():

@@ -61,7 +61,10 @@ class PipelineParams(Params):
     """Parameters of the run that no method owns (`ppl` in the paper's signature)."""
 
     seed: int = Field(
-        0, ge=0, description="one integer; init, sampler, split, background and method streams derive from it"
+        0,
+        ge=0,
+        strict=True,
+        description="one integer; init, sampler, split, background and method streams derive from it",
     )
     device: Literal["auto", "cpu", "cuda"] = Field("auto", description="auto: CUDA if its kernels can run, else CPU")
     threads: int = Field(0, ge=0, le=1024, description="CPU threads; 0: all cores that this process may use")
@@ -100,7 +103,9 @@ class OptimizationParams(Params):
     FULL_ITERATIONS: ClassVar[int] = 30_000
     ENCODING: ClassVar[tuple[str, ...]] = ("codec",)
 
-    iterations: int = Field(30_000, ge=1, description="steps; plans keep their ranges, tasks past the end never fire")
+    iterations: int = Field(
+        30_000, ge=1, le=10**9, description="steps; plans keep their ranges, tasks past the end never fire"
+    )
     scale_schedule: bool = Field(
         False, description="multiply plan bounds, intervals and lr max_steps by iterations / those of a full run"
     )
