@@ -88,7 +88,7 @@ HEAD = 'methods = ["3dgs"]\nscenes = ["demo"]\n'
         (HEAD + f"seeds = [{10**26}]", "a seed is a whole number of 0 or more, of at most 63 bits"),
         (HEAD + f"seeds = {list(range(5001))}", "5,001 runs (methods x scenes x seeds) and 0 overrides; 5,000 and"),
         (HEAD + "[[override]]\n" * 1001, "1 runs (methods x scenes x seeds) and 1,001 overrides"),
-        (HEAD + f"x = {'[' * 100_000}", "more than 100 brackets are open at once"),
+        (HEAD + f"x = {'[' * 100_000}", "its brackets are nested too deeply"),
         (HEAD + "seeds = [1, 2, 1]", "'1' stands twice in `seeds`"),
         (HEAD + "sedes = [1]", "unknown key 'sedes': did you mean 'seeds'?"),
         (HEAD + "[method.3dgs]\nrate = 'r1'", "unknown key 'method.3dgs.rate': did you mean 'rates'?"),

@@ -21,7 +21,7 @@ MODULES = {
     "runs.pretrained": "base_config first_scene make_method named_scenes useful_starts",
     "runs.training": "cached_directory",
     "runs.run": "run train_in",
-    "runs.decode": "export_model exporter_of open_model",
+    "runs.decode": "export_model exporter_of open_model read_gaussians",
     "runs.session": "Session",
     "runs.device": "choose_device",
     "runs.measure": "open_subject",

@@ -49,6 +49,7 @@ from splatwizard_core.runs.config import resolve as resolve
 from splatwizard_core.runs.decode import export_model as export_model
 from splatwizard_core.runs.decode import exporter_of as exporter_of
 from splatwizard_core.runs.decode import open_model as open_model
+from splatwizard_core.runs.decode import read_gaussians as read_gaussians
 from splatwizard_core.runs.device import choose_device as choose_device
 from splatwizard_core.runs.directory import OWN_FILES as OWN_FILES
 from splatwizard_core.runs.directory import RunRequest as RunRequest

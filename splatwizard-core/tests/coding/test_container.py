@@ -326,7 +326,7 @@ def test_who_trusts_a_file_may_raise_its_limit(monkeypatch):
     reader.allow(1 << 30, "a model")
     for bad in ("much", "-1", "9" * 5000):
         monkeypatch.setenv(EXPANSION_VARIABLE, bad)
-        with pytest.raises(ConfigError, match="must be how many bytes") as refused:
+        with pytest.raises(ConfigError, match="must be a number of bytes") as refused:
             reader.allow(1, "a model")
         assert len(str(refused.value)) < 200
 

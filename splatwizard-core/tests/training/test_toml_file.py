@@ -6,13 +6,13 @@ import pytest
 
 from splatwizard_core.errors import ConfigError
 from splatwizard_core.training import toml_file
-from splatwizard_core.training.toml_file import MAX_BRACKETS, MAX_BYTES, MAX_PARTS, read_toml
+from splatwizard_core.training.toml_file import MAX_BYTES, MAX_PARTS, read_toml
 
 QUOTED = '"\\"".' * 40_000
 
 HOSTILE = {
-    "brackets": (b"x = " + b"[" * 100_000, "brackets are open"),
-    "tables in tables": (b"x = " + b"{a=" * 100_000, "brackets are open"),
+    "brackets": (b"x = " + b"[" * 100_000, "its brackets are nested too deeply"),
+    "tables in tables": (b"x = " + b"{a=" * 100_000, "its brackets are nested too deeply"),
     "a dotted key": (b"\n\n" + b"a." * 50_000 + b"a = 1", "line 3 has a key of more than 32 parts"),
     "a dotted table": (b"[" + b" a ." * 50_000 + b"a]", "line 1 has a key"),
     "a dotted key of quotes": (QUOTED.encode() + b"a = 1", "line 1 has a key"),
@@ -24,7 +24,7 @@ HOSTILE = {
 
 @pytest.mark.parametrize("name", HOSTILE)
 def test_a_hostile_file_is_refused_in_one_line(name, tmp_path, monkeypatch):
-    if "digits" not in name:
+    if "dotted" in name:
         monkeypatch.setattr(toml_file.tomllib, "loads", None)  # no parser sees it
     content, told = HOSTILE[name]
     (tmp_path / "x.toml").write_bytes(content)
@@ -61,7 +61,7 @@ def test_a_pipe_of_the_shell_is_read():
 def test_what_people_write_is_read(tmp_path):
     key = ".".join(["a"] * MAX_PARTS)
     text = f"""
-{key} = {"[" * MAX_BRACKETS}1{"]" * MAX_BRACKETS}
+{key} = {"[" * 50}1{"]" * 50}
 more."quoted.key".x = "a.b.c, {"you see. " * 200}"
 # {"-." * 100}
 version = "{".".join("12345678901234567890")}{".1" * 20}"

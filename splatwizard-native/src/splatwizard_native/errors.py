@@ -13,13 +13,10 @@ def shortened(message: str) -> str:
     """A message in which only the ends are left of what is very long, such as a key of a stranger's file."""
 
     def ends(text: str, most: int) -> str:
-        if len(text) <= most:
-            return text
-        return f"{text[: most // 5]}... ({len(text):,} characters) ...{text[-most // 20 :]}"
+        cut = f"{text[: most // 5]}... ({len(text):,} characters) ...{text[-most // 20 :]}"
+        return text if len(text) <= most else cut
 
-    if len(message) > MAX_WORD:
-        message = re.sub(r"\S+", lambda word: ends(word[0], MAX_WORD), message)
-    return ends(message, MAX_MESSAGE)
+    return ends(re.sub(rf"\S{{{MAX_WORD},}}", lambda word: ends(word[0], MAX_WORD), message), MAX_MESSAGE)
 
 
 class ForeseenError(Exception):

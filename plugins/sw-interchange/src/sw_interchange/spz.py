@@ -226,4 +226,6 @@ def _fractional_bits(scene: GaussianScene, options: SpzOptions, report: WriteRep
     if room < options.fractional_bits:
         report.warnings.append(f"coordinates reach to {largest:.4g}: {room} fractional bits instead of "
                                f"{options.fractional_bits}")  # fmt: skip
-    return min(room, options.fractional_bits)
+    bits = min(room, options.fractional_bits)
+    report.coarse(np.float64(2.0**-bits), scene.means, scene.log_scales)
+    return bits

@@ -7,9 +7,8 @@ import os
 from splatwizard_core.errors import ConfigError
 
 FREE = 1 << 24
-"""Bytes of decoded model that any file may stand for."""
-EXPANSION = 256
-"""Bytes more for each byte of the file; real files are below 100."""
+"""Bytes of decoded model that any file may stand for, and EXPANSION more for each of its bytes."""
+EXPANSION = 256  # real files are below 100
 EXPANSION_VARIABLE = "SPLATWIZARD_MAX_EXPANSION"
 
 
@@ -17,28 +16,16 @@ def decoded_limit(size: int) -> int:
     """The most bytes of decoded model that a file of `size` bytes may claim; the environment may allow more.
 
     A few bytes must not make a reader fill its memory. A file that claims more is refused, and none is written.
-    Raises ConfigError if $SPLATWIZARD_MAX_EXPANSION is no whole number.
     """
     text = os.environ.get(EXPANSION_VARIABLE) or str(EXPANSION)
     if not (text.isascii() and text.isdecimal() and len(text) <= 9):
-        raise ConfigError(
-            f"{EXPANSION_VARIABLE} is {text!r:.40}, must be how many bytes a byte of a file may decode to, such as "
-            f"{EXPANSION}",
-            key=EXPANSION_VARIABLE,
-        )
+        raise ConfigError(f"{EXPANSION_VARIABLE} is {text!r:.40}, must be a number of bytes", key=EXPANSION_VARIABLE)
     return FREE + int(text) * size
 
 
 def beyond_limit(decoded: int, size: int) -> str | None:
-    """Reason to refuse a file of `size` bytes that claims `decoded` bytes, and how to read it; None: within the limit.
-
-    To be asked before anything of that size is allocated.
-    """
+    """Reason to refuse a file of `size` bytes that claims `decoded` bytes, and how to read it; None: it may."""
     most = decoded_limit(size)
-    if decoded <= most:
-        return None
     needed = -(-(decoded - FREE) // max(size, 1))
-    return (
-        f"{decoded:,} bytes in memory, a file of {size:,} may stand for at most {most:,}; if you trust it, set "
-        f"{EXPANSION_VARIABLE}={needed}"
-    )
+    reason = f"{decoded:,} bytes in memory, a file of {size:,} may stand for at most {most:,}; if you trust it, set"
+    return f"{reason} {EXPANSION_VARIABLE}={needed}" if decoded > most else None

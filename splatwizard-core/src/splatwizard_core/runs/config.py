@@ -288,7 +288,10 @@ def resolve(
         ppl = apply_overrides(ppl, given[PipelineParams], source=source)
         reading = apply_overrides(reading, given[SceneParams], source=source)
     config = config.completed(plugins, provenance)
-    scene_options = SceneOptions(**reading.model_dump(), seed=ppl.seed)
+    reading_values = reading.model_dump()
+    if reading_values["split"] is not None and os.path.isfile(reading_values["split"]):
+        reading_values["split"] = os.path.abspath(reading_values["split"])  # other processes have other folders
+    scene_options = SceneOptions(**reading_values, seed=ppl.seed)
     return ResolvedConfig(
         method.name, preset, rate, scene_spec, config, ppl, scene_options, provenance, init, pretrained,
         check_settings(plugins.metrics, settings) if settings else {}, procedural,

@@ -42,9 +42,8 @@ def apply_overrides(config: ModelT, values: Mapping[str, Any], *, source: str) -
 
 def _bounded(value: Any) -> Any:
     """Return a value as it is. Raises ValueError for an integer, alone or in a list, that does not fit 64 bits."""
-    for each in value if isinstance(value, (list, tuple)) else (value,):
-        if isinstance(each, int) and abs(each) >= 1 << 63:
-            raise ValueError("an integer does not fit 64 bits")
+    if any(isinstance(x, int) and abs(x) >= 1 << 63 for x in (value if isinstance(value, list | tuple) else [value])):
+        raise ValueError("an integer does not fit 64 bits")
     return value
 
 
