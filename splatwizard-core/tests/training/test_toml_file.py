@@ -15,6 +15,7 @@ HOSTILE = {
     "tables in tables": (b"x = " + b"{a=" * 100_000, "its brackets are nested too deeply"),
     "a dotted key": (b"\n\n" + b"a." * 50_000 + b"a = 1", "line 3 has a key of more than 32 parts"),
     "a dotted table": (b"[" + b" a ." * 50_000 + b"a]", "line 1 has a key"),
+    "a dotted key in a table in line": (b"x = {" + b"a . " * 50_000 + b"b = 1}", "line 1 has a key"),
     "a dotted key of quotes": (QUOTED.encode() + b"a = 1", "line 1 has a key"),
     "a dotted key of apostrophes": (b"'.'." * 50_000 + b"a = 1", "line 1 has a key"),
     "a file without an end": (b"#" * (MAX_BYTES + 1), "1,048,576 bytes are the most"),
@@ -62,6 +63,7 @@ def test_what_people_write_is_read(tmp_path):
     key = ".".join(["a"] * MAX_PARTS)
     text = f"""
 {key} = {"[" * 50}1{"]" * 50}
+scene = '{"/a.b" * 40}'
 more."quoted.key".x = "a.b.c, {"you see. " * 200}"
 # {"-." * 100}
 version = "{".".join("12345678901234567890")}{".1" * 20}"
@@ -69,4 +71,4 @@ version = "{".".join("12345678901234567890")}{".1" * 20}"
     (tmp_path / "x.toml").write_text(text)
     tables, same = read_toml(tmp_path / "x.toml", "--config")
     assert same == text
-    assert set(tables) == {"a", "more", "version"}
+    assert set(tables) == {"a", "scene", "more", "version"}
