@@ -14,6 +14,8 @@ from splatwizard_core.api import SceneError
 
 SUFFIXES = frozenset((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"))
 
+MOST_PARTS = 64
+"""Folders at the end of a path of another machine that are looked for here, one by one."""
 LONGEST_TOLD = 120
 """Characters of a name in a message."""
 
@@ -153,7 +155,7 @@ class _Files:
         if is_inside(name) and not _is_foreign(name):
             return self._like("/".join(parts), name)
         # A path of another machine: its end is looked for here, the longest first.
-        for start in range(len(parts)):
+        for start in range(max(len(parts) - MOST_PARTS, 0), len(parts)):
             end = parts[start:]
             if ".." in end or ":" in end[0] or "\0" in name:
                 continue
