@@ -45,10 +45,8 @@ def run(session: Session, request: RunRequest) -> tuple[schema.Record, Path]:
         def encode_it() -> dict[str, Any]:
             trained = train_in(session, request, directory)
             method = make_method(session.plugins, resolved)
-            facts = encode(
-                method, trained.model, trained.facts["raster"], encoded, session.scene(resolved).origin,
-                deterministic=resolved.ppl.deterministic,
-            )  # fmt: skip
+            raster, origin = trained.facts["raster"], session.scene(resolved).origin
+            facts = encode(method, trained.model, raster, encoded, origin, deterministic=resolved.ppl.deterministic)
             session.say(f"encoded {facts['bytes']:,} bytes in {facts['encode_s']:.2f} s")
             return facts
 
