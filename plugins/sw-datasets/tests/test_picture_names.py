@@ -188,3 +188,20 @@ def test_of_a_path_of_another_machine_the_last_parts_alone_are_looked_for(tmp_pa
 def test_a_model_whose_images_are_a_pipe_has_none(tmp_path, name):
     os.mkfifo(tmp_path / name)
     assert count_images(tmp_path) == 0
+
+
+def test_a_folder_is_listed_once_for_all_masks(tmp_path, load, monkeypatch):
+    (tmp_path / "images").mkdir()
+    frames = []
+    for i in range(9):
+        Image.new("RGB", (32, 24)).save(tmp_path / "images" / f"{i}.png")
+        matrix = [[1, 0, 0, i], [0, 1, 0, i * i], [0, 0, 1, 3], [0, 0, 0, 1]]
+        frames.append({"file_path": f"images/{i}.png", "mask_path": f"gone/{i}.png", "transform_matrix": matrix})
+    frames[0]["mask_path"] = "./images/0.png"
+    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 30, "frames": frames}))
+    listed = []
+    walk = picture_names.list_pictures
+    monkeypatch.setattr(picture_names, "list_pictures", lambda folder: listed.append(folder) or walk(folder))
+    scene = load(tmp_path)
+    assert any("8 masks that 'mask_path' names are not there" in line for line in scene.warnings)
+    assert listed.count(tmp_path) == 1

@@ -94,6 +94,18 @@ def find_pictures(folder: Path, names: Sequence[str], notes: list[str] | None = 
     return found
 
 
+def find_each(folder: Path, names: Sequence[str]) -> list[Path | None]:
+    """The file of each name, as `find_pictures` has it; None where there is none, or it is not clear which."""
+    there, found = _Files(folder), list[Path | None]()
+    for name in names:
+        try:
+            file = there.of(name)
+        except SceneError:
+            file = None
+        found.append(None if file is None else folder / file)
+    return found
+
+
 def short(name: str) -> str:
     """A stranger's name as it stands in a message: printable, and no longer than a line."""
     return repr(name) if len(name) <= LONGEST_TOLD else f"{name[:LONGEST_TOLD]!r}..."
