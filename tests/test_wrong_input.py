@@ -202,7 +202,7 @@ ROWS = [
     Row("train --init {text.ply}", "init: {text.ply}: not a .ply file"),
     Row("run --init {mesh.ply}", "not a 3DGS model"),
     Row("run --init {huge.ply}", "init: {huge.ply}: "),
-    Row("run --init {nan.ply}", "1 of its values are not finite"),
+    Row("run --init {nan.ply}", "init: {nan.ply}: all of its 40 Gaussians mean nothing"),
     Row("train --init {folder}", "init: {folder} is a folder: it has to be the .ply"),
     Row("train --init {trained}", "name the .ply in it, such as {trained}/point_cloud/point_cloud.ply"),
     Row("train --set init={cut.ply}", "init: {cut.ply}: "),

@@ -153,7 +153,7 @@ def make_models(root: Path) -> None:
     (root / "text.ply").write_text("hello")
     damaged = gaussians_from_points(PointCloud(points, torch.full((40, 3), 0.5)), max_sh_degree=1)
     with torch.no_grad():
-        damaged.means[3, 1] = float("nan")
+        damaged.means[:, 1] = float("nan")
     export_ply(damaged, root / "nan.ply")
     (root / "trained" / "point_cloud").mkdir(parents=True)
     shutil.copyfile(ply, root / "trained" / "point_cloud" / "point_cloud.ply")

@@ -83,6 +83,13 @@ HEAD = 'methods = ["3dgs"]\nscenes = ["demo"]\n'
         ('methods = ["3dgs"]\nscenes = []', "`scenes` is empty: there is nothing to run"),
         (HEAD + "seeds = []", "`seeds` is empty: there is nothing to run"),
         (HEAD + "seeds = [-1]", "a seed is a whole number of 0 or more"),
+        (HEAD + "seeds = [2.0]", "bad value 2.0 for 'seeds.0': a seed is a whole number"),
+        (HEAD + "seeds = [true]", "bad value True for 'seeds.0': a seed is a whole number"),
+        (HEAD + f"seeds = [{10**26}]", "a seed is a whole number of 0 or more, of at most 63 bits"),
+        (HEAD + f"seeds = {list(range(5001))}", "5,001 runs (methods x scenes x seeds) and 0 overrides; 5,000 and"),
+        (HEAD + "[[override]]\n" * 1001, "1 runs (methods x scenes x seeds) and 1,001 overrides"),
+        (HEAD + f"x = {'[' * 100_000}", "its brackets are nested too deeply"),
+        (HEAD + "seeds = [1, 2, 1]", "'1' stands twice in `seeds`"),
         (HEAD + "sedes = [1]", "unknown key 'sedes': did you mean 'seeds'?"),
         (HEAD + "[method.3dgs]\nrate = 'r1'", "unknown key 'method.3dgs.rate': did you mean 'rates'?"),
         (HEAD + "[method.hac]\nrates = 'r1'", "[method.hac] is for none of `methods`: there are 3dgs"),
@@ -112,7 +119,7 @@ def test_a_plan_that_cannot_be_read_is_named(tmp_path):
         read_plan(path)
 
 
-@pytest.mark.parametrize("seeds", [[2.0], list(range(1001)), ["1"], [True]])
+@pytest.mark.parametrize("seeds", [[2.0], list(range(5001)), ["1"], [True]])
 def test_seeds_are_whole_numbers_and_not_thousands(seeds):
     with pytest.raises(ConfigError, match="seeds"):
         checked_plan({"methods": ["3dgs"], "scenes": ["demo:tiny"], "seeds": seeds}, "plan")

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 import unicodedata
 
 import pytest
 from PIL import Image
+from sw_datasets import picture_names
+from sw_datasets.loaders.colmap_model import count_images
 from sw_datasets.picture_names import find_pictures, view_name
 
 from splatwizard_core.errors import SceneError
@@ -153,9 +156,11 @@ def test_points_of_a_ply_serve_where_the_model_has_none(colmap_folder, load):
 
 
 def test_many_frames_of_few_pictures_and_endless_names_are_one_short_line(tmp_path, load, monkeypatch):
-    opened = []
-    open_picture = Image.open
-    monkeypatch.setattr(Image, "open", lambda *args, **kwargs: opened.append(args) or open_picture(*args, **kwargs))
+    """Each name is looked for once, and no picture is opened before all of them are there."""
+    looked: list[str] = []
+    of = picture_names._Files.of
+    monkeypatch.setattr(picture_names._Files, "of", lambda self, name: looked.append(name) or of(self, name))
+    monkeypatch.setattr("sw_datasets.gate.read_header", None)
     (tmp_path / "images").mkdir()
     Image.new("RGB", (32, 24)).save(tmp_path / "images" / "0.png")
     matrix = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]
@@ -163,9 +168,40 @@ def test_many_frames_of_few_pictures_and_endless_names_are_one_short_line(tmp_pa
     (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 30, "frames": frames}))
     with pytest.raises(SceneError, match="occurs more than once"):
         load(tmp_path)
-    assert len(opened) <= 2  # not once per frame
+    assert looked == ["images/0.png"]
     frames = [{"file_path": "x" * 60_000, "transform_matrix": matrix}]
     (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 30, "frames": frames}))
     with pytest.raises(SceneError) as caught:
         load(tmp_path)
     assert len(str(caught.value)) < 500
+
+
+def test_of_a_path_of_another_machine_the_last_parts_alone_are_looked_for(tmp_path, monkeypatch):
+    looked: list[str] = []
+    monkeypatch.setattr(picture_names._Files, "_like", lambda self, name, called: looked.append(name))
+    assert picture_names._Files(tmp_path).of("/a" * 30_000) is None
+    assert max(looked, key=len) == "/".join(["a"] * picture_names.MOST_PARTS)
+    assert len(looked) == picture_names.MOST_PARTS
+
+
+@pytest.mark.parametrize("name", ["images.txt", "images.bin"])
+def test_a_model_whose_images_are_a_pipe_has_none(tmp_path, name):
+    os.mkfifo(tmp_path / name)
+    assert count_images(tmp_path) == 0
+
+
+def test_a_folder_is_listed_once_for_all_masks(tmp_path, load, monkeypatch):
+    (tmp_path / "images").mkdir()
+    frames = []
+    for i in range(9):
+        Image.new("RGB", (32, 24)).save(tmp_path / "images" / f"{i}.png")
+        matrix = [[1, 0, 0, i], [0, 1, 0, i * i], [0, 0, 1, 3], [0, 0, 0, 1]]
+        frames.append({"file_path": f"images/{i}.png", "mask_path": f"gone/{i}.png", "transform_matrix": matrix})
+    frames[0]["mask_path"] = "./images/0.png"
+    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 30, "frames": frames}))
+    listed = []
+    walk = picture_names.list_pictures
+    monkeypatch.setattr(picture_names, "list_pictures", lambda folder: listed.append(folder) or walk(folder))
+    scene = load(tmp_path)
+    assert any("8 masks that 'mask_path' names are not there" in line for line in scene.warnings)
+    assert listed.count(tmp_path) == 1

@@ -76,6 +76,16 @@ def lossy_webp() -> bytes:
     return buffer.getvalue()
 
 
+def one_colour(side: int) -> bytes:
+    """A .sog of five pictures of one colour, each of few bytes, which claim a Gaussian for each of their texels."""
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.new("RGBA", (side, side), (9, 9, 9, 255)).save(buffer, "WEBP", lossless=True, exact=True)
+    names = ("means_l", "means_u", "scales", "quats", "sh0")
+    return sog_with({"count": side**2, "shN": None}, **{f"{name}__webp": buffer.getvalue() for name in names})
+
+
 def glb(document: object, blob: bytes = b"") -> bytes:
     text = json.dumps(document).encode() if not isinstance(document, bytes) else document
     text += b" " * (-len(text) % 4)
@@ -109,6 +119,11 @@ def ksplat_with(offset: int, raw: bytes) -> bytes:
 PLY = b"ply\nformat binary_little_endian 1.0\nelement vertex 2\nproperty float x\n"
 ZEROS = zlib.compressobj(9, zlib.DEFLATED, 31)
 GZIP_BOMB = ZEROS.compress(spz_head(count=1) + bytes(1 << 26)) + ZEROS.flush()
+
+
+def spz_of_zeros(count: int, degree: int) -> bytes:
+    row = 20 + 3 * {0: 0, 3: 15}[degree]
+    return gzip.compress(spz_head(count=count, degree=degree) + bytes(row * count))
 
 
 def zstd_bomb() -> bytes:
@@ -167,6 +182,8 @@ BAD = {
     "spz of noise": (b"\x1f\x8b\x08" + bytes(range(200)), "spz"),
     "spz with an extension that is cut off": (
         gzip.compress(spz_head(count=1, degree=0, flags=2) + bytes(20) + struct.pack("<II", 1, 2**32 - 1)), "spz"),
+    "spz of a million zeros": (spz_of_zeros(1 << 20, 0), "spz"),
+    "spz of SH of zeros": (spz_of_zeros(1 << 18, 3), "spz"),
     "spz4 without streams": (spz4(5, streams=0, rest=bytes(99)), "spz"),
     "spz4 with 255 streams": (spz4(5, streams=255, rest=bytes(99)), "spz"),
     "spz4 with a table before the header's end": (spz4(5, start=8, rest=bytes(199)), "spz"),
@@ -207,6 +224,7 @@ BAD = {
     "sog with a huge image": (sog_with(quats__webp=huge_webp()), "sog"),
     "sog with huge images alone": (sog_with({"count": 1 << 20}, **{f"{n}__webp": huge_webp() for n in (
         "means_l", "means_u", "scales", "quats", "sh0")}), "sog"),
+    "sog of one colour": (one_colour(1024), "sog"),
     "sog with a lossy image": (sog_with(quats__webp=lossy_webp()), "sog"),
     "sog with a damaged image": (sog_with(quats__webp=huge_webp().replace(b"\xfe\xbf", b"\3\0")), "sog"),
     "sog bomb": (sog_with(more=bytes(1 << 26)), "sog"),
@@ -263,6 +281,22 @@ def test_a_bad_file_is_refused_within_a_second_of_work(name):
     with pytest.raises(SplatwizardError):
         decode(data, format, limits=LIMITS)
     assert time.process_time() - before < 1
+
+
+@pytest.mark.parametrize("name", ["spz of a million zeros", "spz of SH of zeros", "sog of one colour"])
+def test_a_file_that_repeats_itself_is_read_by_who_says_so(name, monkeypatch):
+    data, format = BAD[name]
+    with pytest.raises(UserInputError, match=r"SPLATWIZARD_MAX_EXPANSION=\d+$") as caught:
+        decode(data, format)
+    monkeypatch.setenv("SPLATWIZARD_MAX_EXPANSION", str(caught.value).rpartition("=")[2])
+    assert decode(data, format).num_gaussians >= 1 << 18
+
+
+def test_pictures_beside_a_description_count_for_what_it_claims(tmp_path):
+    with zipfile.ZipFile(io.BytesIO(one_colour(1024))) as archive:
+        archive.extractall(tmp_path)
+    with pytest.raises(UserInputError, match=r"claims 1,048,576 Gaussians of 58,720,256 bytes in memory"):
+        read(tmp_path)
 
 
 def test_what_stands_after_the_attributes_of_a_gzip_bomb_is_not_inflated(little_memory):

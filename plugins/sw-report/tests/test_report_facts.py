@@ -1,10 +1,12 @@
 """What is read of records: of this release, of others, and of none."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
-from sw_report.facts import LONGEST_TEXT, clean, read_facts
+from sw_report.facts import LARGEST_RECORD, LONGEST_TEXT, clean, read_facts
+from sw_report.runs import collect
 
 from splatwizard_core.errors import UserInputError
 
@@ -88,6 +90,35 @@ def test_a_size_of_nothing_and_infinite_numbers_are_refused(make_run):
         read_facts(directory / "metrics.json")
     directory = make_run("r2", change=lambda content: content["metrics"]["psnr"].update(mean=float("inf")))
     with pytest.raises(UserInputError, match=r"metrics\.psnr\.mean"):
+        read_facts(directory / "metrics.json")
+
+
+HOSTILE = {
+    "an integer of 400 digits": (lambda c: c["speed"].update(fps=10**400), r"an integer of 401 digits"),
+    "one among the rest": (lambda c: c["config"].update(x=[10**400]), r"an integer of 401 digits"),
+    "240,000 view names": (lambda c: c.update(views=[f"v{i}" for i in range(240_000)]), r"240,000 items; 20,000 are"),
+    "many sections": (lambda c: c["file"].update(sections=dict.fromkeys(map(str, range(30_000)), 1)), r"30,000 items"),
+    "a score beyond all": (lambda c: c["metrics"]["psnr"].update(mean=1e308), r"metrics\.psnr\.mean"),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_hostile_record_is_left_out_and_the_others_are_shown(make_run, name):
+    change, told = HOSTILE[name]
+    make_run("r1", change=change)
+    good = make_run("r2")
+    found = collect([good.parent])
+    assert [run.directory for run in found.runs] == [good]
+    (note,) = (note for note in found.notes if note.startswith("left out"))
+    assert re.search(told, note)
+    assert len(note) < 500
+
+
+def test_a_record_of_many_bytes_is_not_read(make_run):
+    directory = make_run()
+    with (directory / "metrics.json").open("r+b") as file:
+        file.truncate(LARGEST_RECORD + 1)
+    with pytest.raises(UserInputError, match="16,000,001 bytes is too large"):
         read_facts(directory / "metrics.json")
 
 

@@ -39,6 +39,7 @@ MODULES = {
     "training.pruner": "Pruner",
     "streams": "stream",
     "coding.container": "ContainerReader ContainerWriter",
+    "coding.limits": "beyond_limit",
     "coding.contracts": (
         "Quantizer EntropyModel ContextModel EntropyCoder PositionCodec ArrayCoder VectorCoder GaussianCodec"
     ),

@@ -8,6 +8,7 @@ from splatwizard_core.coding.contracts import GaussianCodec as GaussianCodec
 from splatwizard_core.coding.contracts import PositionCodec as PositionCodec
 from splatwizard_core.coding.contracts import Quantizer as Quantizer
 from splatwizard_core.coding.contracts import VectorCoder as VectorCoder
+from splatwizard_core.coding.limits import beyond_limit as beyond_limit
 from splatwizard_core.errors import BitstreamError as BitstreamError
 from splatwizard_core.errors import CapabilityError as CapabilityError
 from splatwizard_core.errors import ConfigError as ConfigError

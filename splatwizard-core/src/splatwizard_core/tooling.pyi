@@ -27,7 +27,7 @@ from splatwizard_core.cli.paths import existing_file as existing_file
 from splatwizard_core.cli.setup import Choices as Choices
 from splatwizard_core.cli.setup import open_session as open_session
 from splatwizard_core.cli.setup import takes_choices as takes_choices
-from splatwizard_core.coding.container import decoded_limit as decoded_limit
+from splatwizard_core.coding.limits import decoded_limit as decoded_limit
 from splatwizard_core.errors import RunLockedError as RunLockedError
 from splatwizard_core.evaluation.evaluate import png_names as png_names
 from splatwizard_core.evaluation.evaluate import render_options as render_options
@@ -45,7 +45,6 @@ from splatwizard_core.plugins.manager import load_plugins as load_plugins
 from splatwizard_core.plugins.registry import Entry as Entry
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer as NegotiatedRasterizer
 from splatwizard_core.runs.config import ResolvedConfig as ResolvedConfig
-from splatwizard_core.runs.config import parse_toml as parse_toml
 from splatwizard_core.runs.config import resolve as resolve
 from splatwizard_core.runs.decode import export_model as export_model
 from splatwizard_core.runs.decode import exporter_of as exporter_of
@@ -81,6 +80,7 @@ from splatwizard_core.training.params import SceneParams as SceneParams
 from splatwizard_core.training.pipeline import TrainingRun as TrainingRun
 from splatwizard_core.training.pipeline import TrainingStopped as TrainingStopped
 from splatwizard_core.training.scheduler import build_schedulers as build_schedulers
+from splatwizard_core.training.toml_file import read_toml as read_toml
 from splatwizard_native.files import bytes_with_named as bytes_with_named
 from splatwizard_native.files import file_sha256 as file_sha256
 from splatwizard_native.files import new_folder as new_folder

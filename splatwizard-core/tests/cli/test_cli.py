@@ -170,6 +170,11 @@ def test_debug_adds_the_traceback(capsys: pytest.CaptureFixture[str]):
     assert "there is no such file" in told
 
 
+def test_a_key_of_many_letters_is_not_repeated_whole(capsys: pytest.CaptureFixture[str]):
+    assert main(["schedule", "3dgs", "--set", f"{'k' * 60_000}=1"]) == 2
+    assert len(capsys.readouterr().err) < 3000
+
+
 def test_an_error_nobody_foresaw_is_one_line_and_status_1(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 
 from splatwizard_core.coding import container
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
+from splatwizard_core.coding.limits import EXPANSION_VARIABLE, decoded_limit
 from splatwizard_core.coding.requirements import Requirement
-from splatwizard_core.errors import BitstreamError, PluginError, SceneError, SplatwizardError
+from splatwizard_core.errors import BitstreamError, ConfigError, PluginError, SceneError, SplatwizardError
 from splatwizard_native import DiskFullError
 
 DTYPES = ["bool", "u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f2", "f4", "f8"]
@@ -307,14 +308,27 @@ def test_a_file_says_on_which_machine_alone_it_decodes(static, expected):
 
 def test_what_a_file_may_stand_for_is_bounded_by_its_size():
     writer = small_file()
-    data = writer.to_bytes()
-    reader = ContainerReader(data)
-    reader.allow(container.decoded_limit(len(data)), "a model")
-    with pytest.raises(BitstreamError, match="claims a model of"):
-        reader.allow(container.decoded_limit(len(data)) + 1, "a model")
-    writer.allow(container.FREE, "a model")
-    with pytest.raises(SplatwizardError, match="more than a reader accepts"):
-        writer.allow(container.decoded_limit(len(data)), "a model")  # the header does not count, to be sure
+    writer.static["junk"] = ["x" * 60_000]
+    most = decoded_limit(sum(writer.sections.values()))
+    reader = ContainerReader(writer.to_bytes())
+    assert reader.size > 60_000
+    for allow in (reader.allow, writer.allow):  # the header does not count
+        allow(most, "a model")
+        with pytest.raises(SplatwizardError, match="a model of"):
+            allow(most + 1, "a model")
+
+
+def test_who_trusts_a_file_may_raise_its_limit(monkeypatch):
+    reader = ContainerReader(small_file().to_bytes())
+    with pytest.raises(BitstreamError, match=EXPANSION_VARIABLE) as caught:
+        reader.allow(1 << 30, "a model")
+    monkeypatch.setenv(EXPANSION_VARIABLE, str(caught.value).rpartition("=")[2])
+    reader.allow(1 << 30, "a model")
+    for bad in ("much", "-1", "9" * 5000):
+        monkeypatch.setenv(EXPANSION_VARIABLE, bad)
+        with pytest.raises(ConfigError, match="must be a number of bytes") as refused:
+            reader.allow(1, "a model")
+        assert len(str(refused.value)) < 200
 
 
 def test_missing_files_and_folders_are_bitstream_errors(tmp_path):

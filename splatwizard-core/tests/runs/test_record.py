@@ -125,6 +125,21 @@ def test_a_damaged_record_is_named_with_its_field(tmp_path: Path):
         read_record(path)
 
 
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ('{"method_version": 1' + "0" * 400 + "}", "an integer does not fit 64 bits"),
+        ('{"config": ' + "[" * 100_000, "nested deeper than 32 levels"),
+        ('{"date": NaN}', "nan is not a finite number"),
+    ],
+)
+def test_a_record_of_a_stranger_is_refused_in_a_line(tmp_path: Path, text: str, told: str):
+    path = tmp_path / "metrics.json"
+    path.write_text(text)
+    with pytest.raises(UserInputError, match=rf"metrics\.json: not a result record of schema 3: .*{told}"):
+        read_record(path)
+
+
 @pytest.mark.parametrize("version", [2, 4, True, None])
 def test_a_record_of_another_schema_is_refused(tmp_path: Path, version: Any):
     path = tmp_path / "metrics.json"

@@ -14,6 +14,7 @@ from splatwizard_native.errors import DiskFullError as DiskFullError
 from splatwizard_native.errors import ForeseenError as ForeseenError
 from splatwizard_native.errors import NativeBuildError as NativeBuildError
 from splatwizard_native.errors import out_of_memory as out_of_memory
+from splatwizard_native.errors import shortened as shortened
 from splatwizard_native.lending import lend as lend
 
 if TYPE_CHECKING:
@@ -74,7 +75,10 @@ MODULES = {
     "core_time": "CoreTime",
     "cores": "available_cores",
     "cuda_toolkit": "find_nvcc nvcc_version",
-    "errors": "FULL CompilerMissingError DeviceMemoryError DiskFullError ForeseenError NativeBuildError out_of_memory",
+    "errors": (
+        "FULL CompilerMissingError DeviceMemoryError DiskFullError ForeseenError NativeBuildError out_of_memory "
+        "shortened"
+    ),
     "files": (
         "TEMPORARY bytes_with_named file_sha256 naming_full_disk new_folder remove_folder replacing scratch_folder "
         "sweep write_atomic write_json"

@@ -5,17 +5,29 @@ from __future__ import annotations
 import difflib
 import json
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, StrictInt, ValidationError, field_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator
 
 from splatwizard_core.api import ConfigError
-from splatwizard_core.tooling import parse_toml
+from splatwizard_core.tooling import read_toml
 
-MOST_SEEDS = 1000
 LABEL = re.compile(r"[\w][\w.+-]*")
+MAX_RUNS = 5_000
+"""Runs of one sweep, not counting rate points; each is a line of every table about it."""
+MAX_OVERRIDES = 1_000
+
+
+def _seed(value: Any) -> int:
+    if type(value) is not int or not 0 <= value < 1 << 63:
+        raise ValueError("a seed is a whole number of 0 or more, of at most 63 bits")
+    return value
+
+
+Seed = Annotated[int, BeforeValidator(_seed)]
 
 
 class Table(BaseModel):
@@ -61,7 +73,7 @@ class Override(Values):
 
     methods: tuple[str, ...] = ()
     scenes: tuple[str, ...] = ()
-    seeds: tuple[int, ...] = ()
+    seeds: tuple[Seed, ...] = ()
     skip: bool = False
 
     def meets(self, label: str, scene: str, seed: int) -> bool:
@@ -88,7 +100,7 @@ class Plan(Values):
     out: str | None = None
     methods: tuple[str, ...] = Field(min_length=1)
     scenes: tuple[str, ...] = Field(min_length=1)
-    seeds: tuple[StrictInt, ...] = Field((0,), min_length=1, max_length=MOST_SEEDS)
+    seeds: tuple[Seed, ...] = Field((0,), min_length=1)
     device: str | None = None
     config: str | None = None
     init: str | None = None
@@ -99,13 +111,6 @@ class Plan(Values):
     method: dict[str, MethodTable] = Field({})
     scene: dict[str, Values] = Field({})
     override: tuple[Override, ...] = ()
-
-    @field_validator("seeds")
-    @classmethod
-    def _no_negative(cls, value: tuple[int, ...]) -> tuple[int, ...]:
-        if any(seed < 0 for seed in value):
-            raise ValueError("a seed is a whole number of 0 or more")
-        return value
 
     def method_of(self, label: str) -> str:
         """Name of the method behind a name of the plan."""
@@ -140,13 +145,7 @@ class Plan(Values):
 
 def read_plan(path: str | Path) -> tuple[Plan, str]:
     """Read a plan and its text. Raises ConfigError that names the file and what is wrong in it."""
-    try:
-        text = Path(path).read_bytes().decode()
-    except OSError as error:
-        raise ConfigError(f"cannot read the plan {path}: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path} is not valid TOML: {error}") from None
-    content = parse_toml(text, path)
+    content, text = read_toml(path, "the plan")
     return checked_plan(content, str(path)), text
 
 
@@ -156,6 +155,12 @@ def checked_plan(content: Mapping[str, Any], source: str) -> Plan:
         plan = Plan.model_validate(content)
     except ValidationError as error:
         raise ConfigError(_told(error, source)) from None
+    runs = len(plan.methods) * len(plan.scenes) * len(plan.seeds)
+    if runs > MAX_RUNS or len(plan.override) > MAX_OVERRIDES:
+        raise ConfigError(
+            f"{source}: {runs:,} runs (methods x scenes x seeds) and {len(plan.override):,} overrides; "
+            f"{MAX_RUNS:,} and {MAX_OVERRIDES:,} are the most of one sweep: make several of it"
+        )
     for kind, tables, known in (("method", plan.method, plan.methods), ("scene", plan.scene, plan.scenes)):
         for name in tables:
             if name not in known:
@@ -167,9 +172,9 @@ def checked_plan(content: Mapping[str, Any], source: str) -> Plan:
                 if one not in there:
                     raise ConfigError(f"{source}: override {i}: '{one}' is none of `{name}`: {_hint(one, there)}")
     for name in ("methods", "scenes", "seeds"):
-        twice = [each for each in getattr(plan, name) if getattr(plan, name).count(each) > 1]
-        if twice:
-            raise ConfigError(f"{source}: '{twice[0]}' stands twice in `{name}`: leave one out")
+        twice, times = Counter(getattr(plan, name)).most_common(1)[0]
+        if times > 1:
+            raise ConfigError(f"{source}: '{twice}' stands twice in `{name}`: leave one out")
     for label in plan.methods:
         if not LABEL.fullmatch(label):
             raise ConfigError(f"{source}: '{label}' in `methods` cannot be the name of a folder")

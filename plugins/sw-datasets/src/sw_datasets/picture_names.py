@@ -14,6 +14,8 @@ from splatwizard_core.api import SceneError
 
 SUFFIXES = frozenset((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"))
 
+MOST_PARTS = 64
+"""Folders at the end of a path of another machine that are looked for here, one by one."""
 LONGEST_TOLD = 120
 """Characters of a name in a message."""
 
@@ -92,6 +94,18 @@ def find_pictures(folder: Path, names: Sequence[str], notes: list[str] | None = 
     return found
 
 
+def find_each(folder: Path, names: Sequence[str]) -> list[Path | None]:
+    """The file of each name, as `find_pictures` has it; None where there is none, or it is not clear which."""
+    there, found = _Files(folder), list[Path | None]()
+    for name in names:
+        try:
+            file = there.of(name)
+        except SceneError:
+            file = None
+        found.append(None if file is None else folder / file)
+    return found
+
+
 def short(name: str) -> str:
     """A stranger's name as it stands in a message: printable, and no longer than a line."""
     return repr(name) if len(name) <= LONGEST_TOLD else f"{name[:LONGEST_TOLD]!r}..."
@@ -153,7 +167,7 @@ class _Files:
         if is_inside(name) and not _is_foreign(name):
             return self._like("/".join(parts), name)
         # A path of another machine: its end is looked for here, the longest first.
-        for start in range(len(parts)):
+        for start in range(max(len(parts) - MOST_PARTS, 0), len(parts)):
             end = parts[start:]
             if ".." in end or ":" in end[0] or "\0" in name:
                 continue

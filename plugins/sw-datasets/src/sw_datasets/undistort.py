@@ -234,6 +234,7 @@ def _resample(file: Path, target: Path, lens: _Lens | None, quality: int) -> Non
     if lens is None:
         shutil.copyfile(file, target)
         return
+    pixels = load_picture(file)  # first: it says what is no picture, or too large
     with Image.open(file, formats=FORMATS) as picture:
         kind = picture.format
     # As COLMAP writes them: full chroma, and nothing lost where the format allows it.
@@ -241,7 +242,7 @@ def _resample(file: Path, target: Path, lens: _Lens | None, quality: int) -> Non
         "JPEG": {"quality": quality, "subsampling": 0},
         "WEBP": {"lossless": True},
     }
-    Image.fromarray(_through(lens, load_picture(file))).save(target, format=kind, **known.get(kind, {}))
+    Image.fromarray(_through(lens, pixels)).save(target, format=kind, **known.get(kind, {}))
 
 
 def _resample_mask(mask: Path, target: Path, lens: _Lens | None, size: Size) -> None:

@@ -53,7 +53,8 @@ def _views(scene: Scene) -> Iterator[tuple[Floats, Mask]]:
     from PIL import Image
 
     folder = Path(scene.path or "") / "mask"
-    names = sorted(each for each in os.listdir(folder) if each.lower().endswith(".png")) if folder.is_dir() else []
+    there = os.listdir(folder) if folder.is_dir() else []
+    names = sorted(each for each in there if each.lower().endswith(".png") and (folder / each).is_file())
     projections = (scene.ground_truth["world_mats"] @ scene.ground_truth["scale_mats"]).numpy()
     if len(names) != len(projections):
         raise SceneError(
@@ -63,7 +64,7 @@ def _views(scene: Scene) -> Iterator[tuple[Floats, Mask]]:
     names.sort(key=lambda name: [int(n) for n in re.findall(r"\d+", name)])
     with track("cull by masks", total=len(names), unit="views") as bar:
         for name, projection in zip(names, projections, strict=True):
-            with Image.open(folder / name) as picture:
+            with Image.open(folder / name, formats=("PNG",)) as picture:
                 pixels = np.asarray(picture)
             mask = np.asarray(pixels > 0 if pixels.ndim == 2 else (pixels > 0).any(axis=2))
             yield projection, widened(mask, RADIUS)

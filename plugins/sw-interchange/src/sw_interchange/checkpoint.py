@@ -41,13 +41,13 @@ def read_checkpoint(source: Source, limits: Limits, report: ReadReport) -> Gauss
     for path in others:
         part = Source.open(path)
         report.bytes += len(part.data)
-        limits.check(rows, report.bytes, source.name)
+        limits.check(rows, report.bytes, report.bytes, source.name)
         parts.append(_read_one(part, limits, ReadReport("checkpoint")))
         rows += parts[-1].num_gaussians
         if parts[-1].sh_degree != scene.sh_degree:
             raise BitstreamError(f"{part.name}: its SH degree is {parts[-1].sh_degree}, that of {source.name} is "
                                  f"{scene.sh_degree}: they are no parts of one scene")  # fmt: skip
-        limits.check(rows, report.bytes, source.name)
+        limits.check(rows, report.bytes, report.bytes, source.name)
     return GaussianScene(*(np.concatenate([getattr(part, column) for part in parts]) for column in _COLUMNS))
 
 
@@ -187,7 +187,7 @@ def _array(parts: dict[str, Any], key: str, name: str, limits: Limits) -> Array:
     found = parts.get(key)
     if not isinstance(found, torch.Tensor) or found.layout != torch.strided or not found.dtype.is_floating_point:
         raise BitstreamError(f"{name}: '{key}' is no tensor of numbers")
-    limits.check(len(found) if found.ndim else 0, 4 * found.numel(), name)
+    limits.check(len(found) if found.ndim else 0, 4 * found.numel(), 4 * found.numel(), name)
     # A view may be larger than what it is a view of, and a tensor of the device "meta" has no memory at all.
     if found.device.type != "cpu" or found.numel() * found.itemsize > found.untyped_storage().nbytes():
         raise BitstreamError(f"{name}: '{key}' claims {found.numel():,} numbers, more than are stored of it")

@@ -14,7 +14,7 @@ from sw_interchange.bands import COEFFICIENTS, Array
 from sw_interchange.options import Options
 from sw_interchange.order import morton_order
 from sw_interchange.quats import ROOT_2, from_smallest_three, smallest_three
-from sw_interchange.scene import LARGEST_LOGIT, GaussianScene, Limits, ReadReport, WriteReport, sigmoid
+from sw_interchange.scene import LARGEST_LOGIT, GaussianScene, Limits, ReadReport, WriteReport, decoded_bytes, sigmoid
 from sw_interchange.source import Source
 
 CHUNK = 256
@@ -56,7 +56,7 @@ def read_compressed_ply(source: Source, limits: Limits, report: ReadReport) -> G
     ):
         raise BitstreamError(f"{name}: {len(coefficients)} SH values of {header.count('sh'):,} Gaussians", section="sh")
     k = len(coefficients) // 3
-    limits.check(count, count * (56 + 12 * k), name)
+    limits.check(count, decoded_bytes(count, k), len(source.data), name)
     tables = read_tables(source.data, header, ("chunk", "vertex", *(["sh"] if k else [])), name)
     bounds = _bounds(tables["chunk"])
     chunk = np.arange(count) >> 8

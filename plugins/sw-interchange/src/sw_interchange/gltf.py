@@ -18,7 +18,7 @@ from splatwizard_core.api import BitstreamError, UserInputError
 from sw_interchange.bands import COEFFICIENTS, Array
 from sw_interchange.frames import transformed
 from sw_interchange.gltf_writer import EXTENSION
-from sw_interchange.scene import FLAT, LARGEST_LOGIT, GaussianScene, Limits, ReadReport
+from sw_interchange.scene import FLAT, LARGEST_LOGIT, GaussianScene, Limits, ReadReport, decoded_bytes
 from sw_interchange.source import Source
 
 MAX_JSON = 1 << 24
@@ -38,6 +38,7 @@ class _Document:
     def __init__(self, source: Source, limits: Limits) -> None:
         self.name, self.limits, self.rows, self.read = source.name, limits, 0, 0
         data = source.data
+        self.size = len(data)
         if bytes(data[:4]) != b"glTF":
             raise self.error("a .gltf of text, which is not read: make a .glb of it")
         if len(data) < 20:
@@ -91,7 +92,7 @@ class _Document:
         row = np.dtype((component, (width,)))
         count, stride = self.whole(accessor, "count"), self.whole(view, "byteStride", 0) or row.itemsize
         self.rows += count
-        self.limits.check(count, 4 * width * self.rows, self.name)
+        self.limits.check(count, 4 * width * self.rows, self.size, self.name)
         start = self.whole(view, "byteOffset", 0) + self.whole(accessor, "byteOffset", 0)
         end = start + (stride * (count - 1) + row.itemsize if count else 0)
         inside = self.whole(view, "byteOffset", 0) + self.whole(view, "byteLength")
@@ -208,7 +209,7 @@ def _primitive(document: _Document, primitive: dict[str, Any], place: Matrix, re
     scales = column(f"{EXTENSION}:SCALE", 3, n)
     alphas = column(f"{EXTENSION}:OPACITY", 1, n)[:, 0]
     degree = next((d for d in range(4) if f"{EXTENSION}:SH_DEGREE_{d + 1}_COEF_0" not in attributes), 3)
-    document.limits.check(n, n * (56 + 12 * COEFFICIENTS[degree]), document.name)
+    document.limits.check(n, decoded_bytes(n, COEFFICIENTS[degree]), document.size, document.name)
     rest = np.zeros((n, COEFFICIENTS[degree], 3), np.float32)
     places = [(d, i) for d in range(1, degree + 1) for i in range(2 * d + 1)]
     for k, (d, i) in enumerate(places):

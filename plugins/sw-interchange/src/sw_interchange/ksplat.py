@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from splatwizard_core.api import SH_C0, BitstreamError
 from sw_interchange.bands import COEFFICIENTS, Array
-from sw_interchange.scene import FLAT, GaussianScene, Limits, ReadReport, logit_of_byte
+from sw_interchange.scene import FLAT, GaussianScene, Limits, ReadReport, decoded_bytes, logit_of_byte
 from sw_interchange.source import Source
 
 HEADER, SECTION_HEADER = 4096, 1024
@@ -50,7 +50,7 @@ def read_ksplat(source: Source, limits: Limits, report: ReadReport) -> GaussianS
     name, data = source.name, source.data
     main = _main_header(source)
     report.version = f"0.1, level {main.level}"
-    limits.check(main.count, main.count * 200, name)
+    limits.check(main.count, decoded_bytes(main.count, COEFFICIENTS[2]), len(data), name)
     sections = [_section(data, HEADER + SECTION_HEADER * i, main.level, name) for i in range(main.sections)]
     if sum(each.count for each in sections) != main.count:
         raise BitstreamError(f"{name}: its sections do not hold {main.count:,} Gaussians together")

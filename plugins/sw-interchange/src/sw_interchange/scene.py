@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from splatwizard_core.api import BitstreamError, LeftOut, UserInputError
+from splatwizard_core.api import BitstreamError, LeftOut, UserInputError, beyond_limit
 from sw_interchange.bands import COEFFICIENTS, Array
 from sw_interchange.frames import in_frame
 
@@ -29,33 +29,28 @@ SMALLEST_SCALE, LARGEST_SCALE = np.float32(-87.33), np.float32(88.72)
 
 @dataclass(frozen=True)
 class Limits:
-    """Bounds on what a file may make a reader allocate.
+    """Bounds on what a file may make a reader allocate, besides those by the size of the file.
 
     max_gaussians       rows
     max_output_bytes    of all that is decompressed from it
-    free_gaussians      rows that any file may claim
-    gaussians_per_byte  of the file: as many more it may claim. Real scenes take 5 bytes a Gaussian at the least; a
-                        thousand bytes of one-coloured images or zeros claim as many millions as they like
     """
 
     max_gaussians: int = 1 << 27
     max_output_bytes: int = 16 << 30
-    free_gaussians: int = 1 << 20
-    gaussians_per_byte: int = 4
 
-    def check(self, count: int, decoded_bytes: int, name: str, held_bytes: int | None = None) -> None:
-        """Raise BitstreamError if a file claims more.
-
-        held_bytes  of all files of the scene as they lie on the disk; None: every row lies there as it is
-        """
-        if held_bytes is not None and count > self.free_gaussians + self.gaussians_per_byte * held_bytes:
-            raise BitstreamError(
-                f"{name}: claims {count:,} Gaussians in {held_bytes:,} bytes: no scene is packed so tightly"
-            )
+    def check(self, count: int, decoded_bytes: int, size: int, name: str) -> None:
+        """Raise BitstreamError if a file of `size` bytes claims more, or more than so few bytes may stand for."""
         if count > self.max_gaussians:
             raise BitstreamError(f"{name}: claims {count:,} Gaussians, more than the limit of {self.max_gaussians:,}")
         if decoded_bytes > self.max_output_bytes:
             raise BitstreamError(f"{name}: decodes to {decoded_bytes:,} bytes, the limit is {self.max_output_bytes:,}")
+        if (reason := beyond_limit(decoded_bytes, size)) is not None:
+            raise BitstreamError(f"{name}: claims {count:,} Gaussians of {reason}")
+
+
+def decoded_bytes(count: int, coefficients: int) -> int:
+    """Bytes of Gaussians as float32, with so many SH coefficients a channel besides that of band 0."""
+    return count * (56 + 12 * coefficients)
 
 
 @dataclass

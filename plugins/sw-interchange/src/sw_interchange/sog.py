@@ -21,7 +21,7 @@ from sw_interchange.archive import read_archive
 from sw_interchange.bands import Array
 from sw_interchange.known_formats import MAX_META
 from sw_interchange.quats import ROOT_2, from_smallest_three
-from sw_interchange.scene import LARGEST_LOGIT, GaussianScene, Limits, ReadReport, logit_of_byte
+from sw_interchange.scene import LARGEST_LOGIT, GaussianScene, Limits, ReadReport, decoded_bytes, logit_of_byte
 from sw_interchange.source import Source
 from sw_interchange.webp import LARGEST_SIDE, Pixels, decode_image, image_size
 
@@ -40,6 +40,7 @@ class _Bundle:
     def __init__(self, source: Source, limits: Limits) -> None:
         self.name = source.name
         self.largest = limits.max_output_bytes
+        self.size = len(source.data)  # bytes that the scene is made of
         self.file: Callable[[str], bytes]
         if source.head(2) == b"PK":
             files = read_archive(source, min(limits.max_output_bytes, 64 * len(source.data) + (1 << 24)))
@@ -71,6 +72,7 @@ class _Bundle:
                 raise BitstreamError(
                     f"{self.name}: '{name}', which it names, has {told.st_size:,} bytes; {self.largest:,} are the most"
                 )
+            self.size += told.st_size
             with where.open("rb") as file:
                 return file.read(self.largest)
         except OSError as error:
@@ -149,11 +151,10 @@ def read_sog(source: Source, limits: Limits, report: ReadReport) -> GaussianScen
         raise BitstreamError(f"{bundle.name}: version {version!r:.20} of SOG; 1 and 2 are read")
     report.version = str(version)
     count = _count(bundle, version)
-    limits.check(count, 56 * count, bundle.name)
     # An image has 4 bytes a texel and at most two texels a Gaussian; that of the SH palette has 2^22 bytes.
     bundle.largest = min(limits.max_output_bytes, 8 * count + (1 << 23))
     images = _checked_images(bundle, count)
-    limits.check(count, 56 * count, bundle.name, len(source.data) + sum(len(data) for _, data in images))
+    limits.check(count, decoded_bytes(count, 0), bundle.size, bundle.name)
     shared = {name: _texels(data, name, count) for name, data in images}
     low, high, scales, quats, sh0 = shared.values()
     return GaussianScene(
@@ -257,7 +258,7 @@ def _sh_rest(bundle: _Bundle, count: int, version: int, first: bytes, limits: Li
         raise BitstreamError(f"{name}: a palette of {width}x{height} does not hold {entries:,} entries")
     if image_size(labels_image, labels_name) != image_size(first, name):
         raise BitstreamError(f"{bundle.name}: its images have different sizes")
-    limits.check(count, count * (12 * k + 56), bundle.name)
+    limits.check(count, decoded_bytes(count, k), bundle.size, bundle.name)
     texels = decode_image(palette, name)[:rows, :, :3].reshape(-1, k, 3)[:entries]
     if version == 2:
         centroids = _looked_up(bundle.codebook("shN"), texels, bundle.name)

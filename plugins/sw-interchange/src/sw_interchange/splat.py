@@ -15,6 +15,7 @@ from sw_interchange.scene import (
     Limits,
     ReadReport,
     WriteReport,
+    decoded_bytes,
     linear_scales,
     logit_of_byte,
     normalised,
@@ -40,7 +41,8 @@ def read_splat(source: Source, limits: Limits, report: ReadReport) -> GaussianSc
     data = source.data
     if len(data) == 0 or len(data) % ROW.itemsize:
         raise BitstreamError(f"{source.name}: {len(data):,} bytes are no .splat: that has 32 for each Gaussian")
-    limits.check(len(data) // ROW.itemsize, len(data), source.name)
+    count = len(data) // ROW.itemsize
+    limits.check(count, decoded_bytes(count, 0), len(data), source.name)
     rows = np.frombuffer(data, ROW)
     scales = rows["scales"]
     bad = ~((scales >= 0) & np.isfinite(scales)).all(1)

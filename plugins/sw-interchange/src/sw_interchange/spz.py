@@ -14,8 +14,9 @@ import numpy as np
 
 from splatwizard_core.api import BitstreamError, UserInputError
 from sw_interchange import spz_packing as packing
+from sw_interchange.bands import COEFFICIENTS
 from sw_interchange.options import Options
-from sw_interchange.scene import GaussianScene, Limits, ReadReport, WriteReport
+from sw_interchange.scene import GaussianScene, Limits, ReadReport, WriteReport, decoded_bytes
 from sw_interchange.source import Source
 from sw_interchange.spz_fields import decode_fields, encode_fields, field_sizes
 
@@ -104,6 +105,10 @@ def _parse_head(head: bytes, name: str) -> _Header:
     return _Header(version, count, degree, bits, flags)
 
 
+def _in_memory(header: _Header) -> int:
+    return decoded_bytes(header.count, COEFFICIENTS[header.degree])
+
+
 def _open_123(source: Source, limits: Limits) -> _Header:
     """Versions 1 to 3: one gzip stream (or the same without gzip)."""
     name = source.name
@@ -114,7 +119,7 @@ def _open_123(source: Source, limits: Limits) -> _Header:
         raise BitstreamError(f"{name}: version {header.version} is not gzipped", section="header")
     sizes = field_sizes(header.count, header.version, header.degree)
     whole = 16 + sum(sizes)
-    limits.check(header.count, whole, name, len(source.data))
+    limits.check(header.count, _in_memory(header), len(source.data), name)
     # Deflate makes at most 1032 bytes of one: a count beyond that is a lie, told before anything is allocated.
     if whole > len(source.data) * (1032 if packed else 1):
         raise BitstreamError(f"{name}: claims {header.count:,} Gaussians, too many for its size: it is truncated")
@@ -141,7 +146,7 @@ def _open_4(source: Source, limits: Limits) -> _Header:
         raise BitstreamError(f"{name}: {streams} streams, degree {header.degree} has {len(sizes)}", section="header")
     if header.count > _most_claimed(len(data)):
         raise BitstreamError(f"{name}: claims {header.count:,} Gaussians, too many for its size", section="header")
-    limits.check(header.count, sum(sizes), name, len(data))
+    limits.check(header.count, _in_memory(header), len(data), name)
     at = start + 16 * streams
     if start < 32 or at > len(data):
         raise BitstreamError(f"{name}: its table of contents lies outside of the file", section="contents")

@@ -19,16 +19,22 @@ from sw_report import numbers
 from sw_report.declared import metric_style, uncompressed
 
 LONGEST_TEXT = 300
-LARGEST_RECORD = 64_000_000  # bytes; ten thousand views with ten metrics take a tenth of it
+LARGEST_RECORD = 16_000_000  # bytes; ten thousand views with ten metrics take less than half of it
+MOST_ITEMS = 20_000  # of a list or object of a record, such as its views
 
 
 def clean(text: str) -> str:
     """Text that cannot reorder or hide what stands around it: control characters are replaced, length is bounded."""
-    kept = "".join("\N{REPLACEMENT CHARACTER}" if unicodedata.category(c) in ("Cc", "Cf", "Cs") else c for c in text)
+    kept = text[: LONGEST_TEXT + 1]
+    if not (kept.isascii() and kept.isprintable()):
+        bad = ("Cc", "Cf", "Cs")
+        kept = "".join("\N{REPLACEMENT CHARACTER}" if unicodedata.category(c) in bad else c for c in kept)
     return kept if len(kept) <= LONGEST_TEXT else kept[: LONGEST_TEXT - 1] + "…"
 
 
 Text = Annotated[str, AfterValidator(clean)]
+Score = Annotated[float, Field(ge=-1e12, le=1e12)]
+"""Value of a metric, with room for sums, means and slopes."""
 
 
 class Facts(BaseModel):
@@ -58,8 +64,8 @@ class ProtocolFacts(Facts):
 class MetricFacts(Facts):
     """One image metric."""
 
-    mean: float | None = None
-    per_view: list[float | None] = []
+    mean: Score | None = None
+    per_view: list[Score | None] = []
     direction: Text = "higher"
     diagnostic: bool = False
 
@@ -216,6 +222,23 @@ OTHER_SCHEMA = f"record of schema {{}}, this release writes {SCHEMA}: a dash may
 INDISPENSABLE = ("schema_version", "method", "scene", "protocol", "file", "metrics")
 
 
+def _integer(digits: str) -> int:
+    if len(digits) > 20:  # no float holds one of 400 digits
+        raise ValueError(f"an integer of {len(digits):,} digits")
+    return int(digits)
+
+
+def _check_items(content: Any) -> None:
+    """Raise ValueError for a list or object of more items than any record has."""
+    waiting = [content]
+    while waiting:
+        part = waiting.pop()
+        if len(part) > MOST_ITEMS:
+            raise ValueError(f"a list or object of {len(part):,} items; {MOST_ITEMS:,} are the most")
+        inside = part.values() if isinstance(part, dict) else part
+        waiting += [each for each in inside if isinstance(each, (dict, list))]
+
+
 def read_facts(path: Path) -> tuple[RunFacts, list[str]]:
     """Read a record; return its facts, and notes on parts of it that could not be understood.
 
@@ -224,13 +247,14 @@ def read_facts(path: Path) -> tuple[RunFacts, list[str]]:
     try:
         if path.stat().st_size > LARGEST_RECORD:
             raise UserInputError(f"{path}: {path.stat().st_size:,} bytes is too large for a result record")
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8"), parse_int=_integer)
+        if not isinstance(content, dict):
+            raise UserInputError(f"{path}: not a result record: it holds no object")
+        _check_items(content)
     except OSError as error:
         raise UserInputError(f"{path}: cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
         raise UserInputError(f"{path}: not a result record: {error}") from None
-    if not isinstance(content, dict):
-        raise UserInputError(f"{path}: not a result record: it holds no object")
     notes: list[str] = []
     version = content.get("schema_version")
     if version != SCHEMA:

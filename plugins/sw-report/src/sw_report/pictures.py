@@ -130,7 +130,8 @@ def scene_gallery(
     runs: Sequence[Run], views: int, truth: Truth, budget: PictureBudget, side: int = LONGEST_SIDE_OF_MANY
 ) -> Gallery:
     """Pictures of several runs of one scene and protocol: the same views of each."""
-    common = [name for name in runs[0].facts.views if all(name in run.facts.views for run in runs)]
+    views_of = [set(run.facts.views) for run in runs]
+    common = [name for name in runs[0].facts.views if all(name in views for views in views_of)]
     chosen = [common[i] for i in even_views(len(common))]
     chosen = [chosen[i] for i in even_views(len(chosen), min(views, len(chosen)))] if chosen else []
     picked = pick_evenly(runs, MOST_RUNS)

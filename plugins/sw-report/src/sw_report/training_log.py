@@ -78,7 +78,8 @@ def read_training(path: Path, points: int = POINTS) -> TrainingCurves:
                 if _is_number(entry.get("loss")):
                     losses.append((float(last), float(entry["loss"])))
                 for key in entry:
-                    if key.startswith("num_") and _is_number(entry[key]):
+                    known = key in counts or len(counts) < MOST_CURVES
+                    if key.startswith("num_") and known and _is_number(entry[key]):
                         counts.setdefault(key, []).append((float(last), float(entry[key])))
                 for name, value in _numbers(entry.get("scalars")):
                     if name in scalars or len(scalars) < MOST_CURVES:

@@ -31,6 +31,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatwizard_core.coding.array_section import pack_array, unpack_array
+from splatwizard_core.coding.limits import beyond_limit, decoded_limit
 from splatwizard_core.coding.requirements import Requirement, dump_requirements, parse_requirements
 from splatwizard_core.errors import BitstreamError, PluginError, SplatwizardError
 from splatwizard_native import dump_strict, load_strict, write_atomic
@@ -39,9 +40,6 @@ MAGIC = b"SPWZ"
 VERSION = 1
 MAX_HEADER = 1 << 19  # 512 KiB; anything longer belongs into a section
 MAX_SECTIONS = 4096
-EXPANSION = 1024
-"""Bytes of decoded model that each byte of a file may stand for, and FREE more; real files are below 100."""
-FREE = 1 << 24
 NAME = re.compile(r"(?!header$)[A-Za-z0-9_][A-Za-z0-9_./-]{0,63}")  # "header" would clash in the breakdown
 METHOD_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
 PREFIX = struct.Struct("<4sHI")
@@ -49,14 +47,6 @@ CRC = struct.Struct("<I")
 WORLD_ORIGIN = "world_origin"
 """Header value beside those of the method: where the origin of the coordinates lies in the world of the scene."""
 HEADER = {"method": str, "method_version": int, "raster": dict, "static": dict, "sections": list}
-
-
-def decoded_limit(size: int) -> int:
-    """The most bytes of decoded model that a file of `size` bytes may claim.
-
-    A few bytes must not make a reader fill its memory. A file that claims more is refused, and none is written.
-    """
-    return FREE + EXPANSION * size
 
 
 class ContainerWriter:
@@ -367,14 +357,11 @@ class ContainerReader:
     def allow(self, decoded: int, what: str) -> None:
         """Raise BitstreamError if a file of this size may not stand for `decoded` bytes of `what`.
 
-        To be asked before anything of that size is allocated; `decoded_limit` has the rule.
+        To be asked before anything of that size is allocated; `decoded_limit` has the rule. The header does not count:
+        it holds no model.
         """
-        if decoded > decoded_limit(self.size):
-            raise self._damage(
-                f"claims {what} of {decoded:,} bytes, a file of {self.size:,} may stand for at most "
-                f"{decoded_limit(self.size):,}",
-                "header",
-            )
+        if (reason := beyond_limit(decoded, sum(self.sections.values()))) is not None:
+            raise self._damage(f"claims {what} of {reason}", "header")
 
     def integer(self, key: str, *, low: int, high: int) -> int:
         """The integer `static[key]` in low..high. Raises BitstreamError if it is missing or outside."""

@@ -7,8 +7,6 @@ import functools
 import hashlib
 import json
 import os
-import re
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,21 +22,14 @@ from splatwizard_core.training.identity import DEFAULTS, all_values, given_value
 from splatwizard_core.training.keys import block_keys, dotted, field_at, flatten, input_files, set_at, value_at
 from splatwizard_core.training.overrides import apply_overrides, unknown_key
 from splatwizard_core.training.params import OptimizationParams, Params, PipelineParams, SceneParams
+from splatwizard_core.training.toml_file import read_toml
 from splatwizard_native import file_sha256
 
 if TYPE_CHECKING:
     from splatwizard_core.method import Method
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
 __all__ = ["ResolvedConfig", "apply_overrides", "parse_set", "rate_points", "read_config_file", "resolve"]
 
-MAX_TOML = 1 << 20  # bytes of a configuration file
-MAX_PARTS = 50
-DEEP_KEY = re.compile(rf"""(?<![\w"'-])(?:[\w"'-]+[ \t]*\.[ \t]*){{{MAX_PARTS}}}""")
 RESERVED = ("method", "preset", "rate", "scene")
 SCENE_KEYS = tuple(SceneParams.model_fields)
 PRETRAINED = "pretrained."  # keys of the method whose trained scene a run starts from
@@ -226,34 +217,9 @@ def rate_points(method: type[Method], asked: str) -> list[str]:
     return sorted(set(found), key=names.index)
 
 
-def parse_toml(text: str, path: str | Path) -> dict[str, Any]:
-    """Parse a TOML file of a stranger in bounded time and memory. Raises ConfigError.
-
-    Keys of thousands of parts take the parser gigabytes, brackets of as many levels the interpreter's stack.
-    """
-    if len(text) > MAX_TOML:
-        raise ConfigError(f"{path} has more than {MAX_TOML:,} bytes: no configuration is so long")
-    if deep := DEEP_KEY.search(text):
-        line = text.count("\n", 0, deep.start()) + 1
-        raise ConfigError(f"{path}, line {line}: a key of more than {MAX_PARTS} parts: no configuration is so deep")
-    try:
-        tables: dict[str, Any] = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        reason = "its brackets are nested too deeply" if isinstance(error, RecursionError) else error
-        raise ConfigError(f"{path} is not valid TOML: {reason}") from None
-    return tables
-
-
 def read_config_file(path: str | Path) -> dict[str, Any]:
     """Read the tables of a TOML file, its names checked. Raises ConfigError that names the line or the key."""
-    try:
-        with open(path, "rb") as file:
-            content = file.read(MAX_TOML + 1)
-        tables = parse_toml(content.decode(), path)
-    except OSError as error:
-        raise ConfigError(f"cannot read --config {path}: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path} is not valid TOML: {error}") from error
+    tables, _ = read_toml(path, "--config")
     for name in RESERVED:
         value = tables.get(name, "a name")
         if not isinstance(value, str) or not value.strip():

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from splatwizard_core.errors import SplatwizardError, UserInputError
-from splatwizard_native import write_atomic
+from splatwizard_native import load_strict, write_atomic
 
 SCHEMA: Literal[3] = 3
 FILE_NAME = "metrics.json"
@@ -261,13 +261,15 @@ class Record(Part):
 def read_record(path: Path) -> Record:
     """Return a record from its file. Raises UserInputError that names what is wrong first."""
     try:
-        return Record.model_validate_json(path.read_bytes())
+        return Record.model_validate(load_strict(path.read_bytes()))
     except OSError as error:
         raise UserInputError(f"{path}: cannot be read: {error.strerror}") from error
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"])) or "the file"
         raise UserInputError(f"{path}: not a result record of schema {SCHEMA}: {where}: {first['msg']}") from None
+    except ValueError as error:
+        raise UserInputError(f"{path}: not a result record of schema {SCHEMA}: {error}") from None
 
 
 def complete_record(values: Mapping[str, Any]) -> Record:

@@ -31,13 +31,20 @@ def apply_overrides(config: ModelT, values: Mapping[str, Any], *, source: str) -
         if annotation is None:
             raise unknown_key(key, block_keys(cls), source)
         try:
-            set_at(content, key, parse_text(annotation, value) if isinstance(value, str) else value)
+            set_at(content, key, _bounded(parse_text(annotation, value) if isinstance(value, str) else value))
         except ValueError as error:
             raise ConfigError(f"bad value '{value}' for '{key}' in {source}: {error}", key=key) from None
     try:
         return cls.model_validate(content)
     except ValidationError as error:
         raise _bad_value(error, values, source, block_keys(cls)) from None
+
+
+def _bounded(value: Any) -> Any:
+    """Return a value as it is. Raises ValueError for an integer, alone or in a list, that does not fit 64 bits."""
+    if any(isinstance(x, int) and abs(x) >= 1 << 63 for x in (value if isinstance(value, list | tuple) else [value])):
+        raise ValueError("an integer does not fit 64 bits")
+    return value
 
 
 def unknown_key(key: str, known: Collection[str], source: str) -> ConfigError:
@@ -55,6 +62,8 @@ def _bad_value(
     path = ".".join(map(str, first["loc"]))
     key = max((k for k in values if path == k or path.startswith(f"{k}.")), key=len, default=path)
     reason = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
+    if first["type"] == "int_parsing_size":
+        reason = "a whole number that fits 64 bits"
     if not key:
         return ConfigError(f"bad combination of values in {source}: {reason}")
     value = values.get(key, first.get("input"))

@@ -89,7 +89,10 @@ class PipelineParams(Params):
     """Parameters of the run that no method owns (`ppl` in the paper's signature)."""
 
     seed: int = Field(
-        0, ge=0, description="one integer; init, sampler, split, background and method streams derive from it"
+        0,
+        ge=0,
+        strict=True,
+        description="one integer; init, sampler, split, background and method streams derive from it",
     )
     device: Annotated[Literal["auto", "cpu", "cuda"], SameResult()] = Field(
         "auto", description="auto: CUDA if its kernels can run, else CPU"
@@ -130,7 +133,7 @@ class OptimizationParams(Params):
     ABSENT: ClassVar[Mapping[str, Any]] = {}
 
     iterations: int = Field(
-        30_000, ge=1, le=1_000_000_000, description="steps; plans keep their ranges, tasks past the end never fire"
+        30_000, ge=1, le=10**9, description="steps; plans keep their ranges, tasks past the end never fire"
     )
     scale_schedule: bool = Field(
         False, description="multiply plan bounds, intervals and lr max_steps by iterations / those of a full run"

@@ -75,7 +75,7 @@ def _parse_one(kind: Any, text: str) -> Any:
     if isinstance(kind, type) and issubclass(kind, BaseModel):
         raise ValueError("this is a block, set one of its keys")
     if kind is Any:
-        with contextlib.suppress(ValueError):
+        with contextlib.suppress(ValueError, RecursionError):
             return json.loads(text)
     return text
 

@@ -158,14 +158,14 @@ def no_points() -> ColmapPoints:
 
 def count_images(folder: Path) -> int:
     """The number of registered images that images.bin (or .txt) of a model claims; 0 where it cannot be read."""
+    # Before it is opened: opening a pipe waits for a writer.
+    binary, text = (path if path.is_file() else None for path in (folder / "images.bin", folder / "images.txt"))
     try:
-        with (folder / "images.bin").open("rb") as file:
-            return int.from_bytes(file.read(8), "little")
-    except OSError:
-        pass
-    try:
-        return len(_text_lines(folder / "images.txt")) // 2
-    except SceneError:
+        if binary is not None:
+            with binary.open("rb") as file:
+                return int.from_bytes(file.read(8), "little")
+        return 0 if text is None else len(_text_lines(text)) // 2
+    except (OSError, SceneError):
         return 0
 
 

@@ -24,7 +24,7 @@ from sw_datasets.families import TRANSFORMS
 from sw_datasets.gate import Gate
 from sw_datasets.loaders.colmap import mask_files
 from sw_datasets.name_lists import NameLists
-from sw_datasets.picture_names import SUFFIXES, find_pictures, is_inside, view_name
+from sw_datasets.picture_names import SUFFIXES, find_each, find_pictures, is_inside, view_name
 from sw_datasets.rules import rules_for, unused_option_warnings
 from sw_datasets.start_points import cloud_beside, points_in_sight, read_cloud
 
@@ -189,16 +189,12 @@ def _name_list(names: Any, key: str, where: str) -> tuple[str, ...]:
 def _masks(path: Path, frames: list[Any], names: list[str], warnings: list[str]) -> list[Path | None]:
     """The mask of each frame: its `mask_path`, else one beside, as in COLMAP scenes."""
     masks = mask_files(path, names)
-    missing = 0
-    for i, frame in enumerate(frames):
-        told = frame.get("mask_path")
-        if not isinstance(told, str) or not told:
-            continue
-        try:
-            masks[i] = find_pictures(path, [told.removeprefix("./")])[0]
-        except SceneError:
-            missing += 1
-    if missing:
+    told = {i: frame["mask_path"] for i, frame in enumerate(frames) if isinstance(frame.get("mask_path"), str)}
+    told = {i: name.removeprefix("./") for i, name in told.items() if name}
+    found = find_each(path, list(told.values()))
+    for i, mask in zip(told, found, strict=True):
+        masks[i] = mask or masks[i]
+    if missing := found.count(None):
         warnings.append(f"{missing} masks that 'mask_path' names are not there")
     return masks
 
