@@ -90,7 +90,7 @@ def unmet_requirement(dist: importlib.metadata.Distribution | None) -> str | Non
         try:
             requirement = Requirement(text)
         except InvalidRequirement:
-            continue
+            return f"its metadata requires {text[:80]!r}, which cannot be read: have its author mend `dependencies`"
         if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
             continue
         try:

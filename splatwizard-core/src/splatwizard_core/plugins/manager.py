@@ -18,6 +18,7 @@ from splatwizard_core.plugins.catalogue import normal_name
 from splatwizard_core.plugins.guards import guarded_hooks, one_line, prints_to_stderr
 from splatwizard_core.plugins.loading import PluginInfo
 from splatwizard_core.plugins.registry import Coders, Entry, Registry, TypedRegistry
+from splatwizard_core.plugins.strangers_code import strangers_code
 from splatwizard_native import ForeseenError
 
 if TYPE_CHECKING:
@@ -103,7 +104,7 @@ class PluginManager:
             obstacle = loading.taken_key(info, self.plugins) or loading.unmet_requirement(entry_point.dist)
             if obstacle is not None:
                 raise PluginError(obstacle)
-            with prints_to_stderr():
+            with self._held(info, registering=True):
                 module = entry_point.load()
             hooks = guarded_hooks(module, self._pluggy, functools.partial(self._guard, info))
             self._pluggy.register(hooks)
@@ -126,7 +127,7 @@ class PluginManager:
             if isinstance(argument, Registry):
                 argument._owner = (info.distribution, info.version, info.foreign)
         try:
-            with contextlib.nullcontext() if hook == "run_finished" else prints_to_stderr():  # that one prints tables
+            with self._held(info, registering=registering, prints=hook == "run_finished"):  # that one prints tables
                 yield
         except (Exception, SystemExit) as error:
             log.debug("plugin %s: %s failed", info.distribution, hook, exc_info=True)
@@ -135,15 +136,25 @@ class PluginManager:
                 return
             info.error = f"{hook}: {one_line(error)}"
 
+    @staticmethod
+    def _held(info: PluginInfo, *, registering: bool, prints: bool = False) -> contextlib.AbstractContextManager[Any]:
+        """Around a plugin's module and hooks: what it prints stands in no output; a stranger changes nothing else."""
+        if not info.foreign:
+            return contextlib.nullcontext() if prints else prints_to_stderr()
+        whose, package = f"{info.distribution} {info.version}", info.module.partition(":")[0].partition(".")[0]
+        return strangers_code(whose, registering=package if registering else "", prints=prints)
+
     @contextlib.contextmanager
     def guarding(self, registry: Registry, name: str) -> Iterator[None]:
         """Make whatever an entry raises that is no error for users a PluginError that names its distribution."""
+        entry = registry.entry(name)
         try:
-            yield
+            with entry.held():
+                yield
         except (ForeseenError, OSError):
             raise
         except (Exception, SystemExit) as error:
-            raise PluginError(f"{registry.entry(name).whose} failed: {one_line(error)}") from error
+            raise PluginError(f"{entry.whose} failed: {one_line(error)}") from error
 
     def read_gaussians(self, path: Path) -> GaussianModel:
         """Read explicit Gaussians by the importer whose suffix `path` has, else as .ply. Raises UserInputError."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import importlib
 from collections.abc import Callable, Iterator, Mapping
@@ -13,6 +14,7 @@ from splatwizard_core.errors import PluginError
 from splatwizard_core.plugins.catalogue import catalogue, is_ours, package_of
 from splatwizard_core.plugins.fields import illegal
 from splatwizard_core.plugins.guards import prints_to_stderr
+from splatwizard_core.plugins.strangers_code import strangers_code
 
 T = TypeVar("T")
 
@@ -46,11 +48,15 @@ class Entry:
         """`metric 'sharpness' of sw-theirs 0.2`: how a message names it."""
         return f"{self.kind} '{self.name}' of {self.distribution} {self.version}"
 
+    def held(self) -> contextlib.AbstractContextManager[Any]:
+        """A context for code of this entry: a stranger's is kept from changing what is not its own."""
+        return strangers_code(self.whose) if self.foreign else contextlib.nullcontext()
+
     def load(self) -> Any:
         """Import the target. Raises PluginError that names the distribution."""
         module_name, _, attribute = self.target.partition(":")
         try:
-            with prints_to_stderr():
+            with prints_to_stderr(), self.held():
                 found: Any = importlib.import_module(module_name)
                 for part in attribute.split("."):
                     found = getattr(found, part)
