@@ -17,6 +17,7 @@ from splatwizard_core.plugins import hookspecs, loading
 from splatwizard_core.plugins.catalogue import normal_name
 from splatwizard_core.plugins.guards import guarded_hooks, one_line, prints_to_stderr
 from splatwizard_core.plugins.loading import PluginInfo
+from splatwizard_core.plugins.migration import migration_hint
 from splatwizard_core.plugins.registry import Coders, Entry, Registry, TypedRegistry
 from splatwizard_core.plugins.strangers_code import strangers_code
 from splatwizard_native import ForeseenError
@@ -102,6 +103,7 @@ class PluginManager:
         hooks = None
         try:
             obstacle = loading.taken_key(info, self.plugins) or loading.unmet_requirement(entry_point.dist)
+            obstacle = obstacle or (loading.taken_module(entry_point.dist) if info.foreign else None)
             if obstacle is not None:
                 raise PluginError(obstacle)
             with self._held(info, registering=True):
@@ -113,7 +115,7 @@ class PluginManager:
         except (Exception, SystemExit) as error:  # a module that exits when it is imported must not end `sw`
             if self._pluggy.is_registered(hooks):  # with some of its hooks
                 self._pluggy.unregister(hooks)
-            info.error = one_line(error)
+            info.error = one_line(error) + migration_hint(info.distribution, error)
             log.debug("plugin %s could not be loaded", info.distribution, exc_info=True)
 
     @contextlib.contextmanager
@@ -134,7 +136,7 @@ class PluginManager:
             if not registering:
                 log.warning("%s %s: %s failed: %s", info.distribution, info.version, hook, one_line(error))
                 return
-            info.error = f"{hook}: {one_line(error)}"
+            info.error = f"{hook}: {one_line(error)}{migration_hint(info.distribution, error)}"
 
     @staticmethod
     def _held(info: PluginInfo, *, registering: bool, prints: bool = False) -> contextlib.AbstractContextManager[Any]:
@@ -225,4 +227,6 @@ def load_plugins() -> PluginManager:
     """
     names = os.environ.get("SW_PLUGINS")
     only = None if names is None else {n.strip() for n in names.split(",") if n.strip()}
+    for line in loading.shadowed():
+        log.warning("%s", line)
     return PluginManager(loading.installed_entry_points(hookspecs.ENTRY_POINT_GROUP), only)

@@ -14,6 +14,7 @@ from splatwizard_core.errors import PluginError
 from splatwizard_core.plugins.catalogue import catalogue, is_ours, package_of
 from splatwizard_core.plugins.fields import illegal
 from splatwizard_core.plugins.guards import prints_to_stderr
+from splatwizard_core.plugins.migration import migration_hint
 from splatwizard_core.plugins.strangers_code import strangers_code
 
 T = TypeVar("T")
@@ -61,7 +62,7 @@ class Entry:
                 for part in attribute.split("."):
                     found = getattr(found, part)
         except (Exception, SystemExit) as error:
-            why = f"{type(error).__name__}: {error}"
+            why = f"{type(error).__name__}: {error}{migration_hint(self.distribution, error)}"
             raise PluginError(f"{self.whose} could not be loaded from {self.target}: {why}") from error
         own = getattr(found, "name", self.name)
         if self.kind == "method" and own != self.name:  # files and records would name what nobody can ask for
