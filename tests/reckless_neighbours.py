@@ -18,6 +18,8 @@ IMPORTS = {
     "sw-seeds": ("import random\nrandom.seed(0)\n", "changes the random numbers of Python"),
     "sw-recursion": ("import sys\nsys.setrecursionlimit(200)\n", "changes the limit of recursion"),
     "sw-ctrl-c": ("import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)\n", "changes who answers SIGINT"),
+    "sw-silences": ("import logging\nlogging.disable(logging.CRITICAL)\n", "changes how much is logged"),
+    "sw-handlers": ("import logging\nlogging.root.handlers.clear()\n", "changes who writes what is logged"),
     "sw-thread": (
         "import threading, time\nthreading.Thread(target=time.sleep, args=(600,), name='their thread').start()\n",
         "starts a thread (their thread)",

@@ -77,7 +77,7 @@ def test_half_an_import_of_another_package_is_waited_for(tmp_path):
     )
     done = site.sw("list-plugins", "--json")
     assert Listed(json.loads(done.stdout)).working["sw-heavy"] == {"metric heavy"}
-    assert "sw-heavy 0.1 is being registered for 3 s" in done.stderr
+    assert "sw-heavy 0.1 is being imported for 3 s" in done.stderr
 
 
 # ------------------------------------------------------------------------------------------ metrics, in a training
@@ -117,6 +117,7 @@ METHOD = """
 @hookimpl
 def register_methods(registry):
     registry.add("leaves", "sw_leaves_method:Leaves", summary="")
+    registry.add("slow", "sw_slow_target:Slow", summary="")
 
 from splatwizard_core.api import Method
 
@@ -125,6 +126,15 @@ class Leaves(Method):
     def stages(self):
         import os
         os._exit(0)
+"""
+TARGET = """
+import time
+from splatwizard_core.api import Method
+
+time.sleep(3.5)
+
+class Slow(Method):
+    name = "slow"
 """
 RENDER = "render scene.swz --scene demo:tiny --set raster.prefer=['{}'] --out pictures-{}"
 TRAIN = "train --method 3dgs --scene demo:tiny --set iterations=2 --set raster.prefer=['{}'] --out out-{}"
@@ -138,10 +148,10 @@ def commands(tmp_path_factory: pytest.TempPathFactory):
     (site.folder / "scene.swz").write_bytes(golden.read_bytes())
     for name, (body, _) in {**RASTERIZERS, **TRAINED}.items():
         site.install(name, rasterizer(name, body))
-    site.install("sw-leaves-method", METHOD)
+    site.install("sw-leaves-method", METHOD, sw_slow_target=TARGET)
     words = [RENDER.format(*[name.removeprefix("sw-")] * 2) for name in RASTERIZERS]
     words += [TRAIN.format(*[name.removeprefix("sw-")] * 2) for name in TRAINED]
-    words += ["schedule leaves"]
+    words += ["schedule leaves", "schedule slow"]
     return dict(zip(words, site.sw_each([each.split() for each in words]), strict=True))
 
 
@@ -159,6 +169,10 @@ def test_a_step_that_ends_the_process_is_a_failure_by_name(commands):
     done = commands["schedule leaves"]
     assert "ProcessExit: os._exit(0) (in sw-leaves-method 0.1)" in done.stderr
     assert done.status == 1
+
+
+def test_a_target_whose_import_takes_its_time_is_named(commands):
+    assert "method 'slow' of sw-leaves-method 0.1 is being imported for 3 s" in commands["schedule slow"].stderr
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import random
 import signal
@@ -62,6 +63,8 @@ def _is_there(name: str) -> bool:
 def _state() -> dict[str, tuple[Any, Callable[[Any], Any], Any]]:
     """Return (value, how it is written, value in a fresh process or None) by the words that name it."""
     found: dict[str, tuple[Any, Callable[[Any], Any], Any]] = {
+        "how much is logged": (logging.root.manager.disable, logging.disable, None),
+        "who writes what is logged": ([*logging.root.handlers], partial(setattr, logging.root, "handlers"), None),
         "the random numbers of Python": (random.getstate(), random.setstate, None),
         "the limit of recursion": (sys.getrecursionlimit(), sys.setrecursionlimit, None),
     }

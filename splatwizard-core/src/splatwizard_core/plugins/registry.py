@@ -49,15 +49,15 @@ class Entry:
         """`metric 'sharpness' of sw-theirs 0.2`: how a message names it."""
         return f"{self.kind} '{self.name}' of {self.distribution} {self.version}"
 
-    def held(self) -> contextlib.AbstractContextManager[Any]:
+    def held(self, *, imports: bool = False) -> contextlib.AbstractContextManager[Any]:
         """A context for code of this entry: a stranger's is kept from changing what is not its own."""
-        return strangers_code(self.whose) if self.foreign else contextlib.nullcontext()
+        return strangers_code(self.whose, imports=imports) if self.foreign else contextlib.nullcontext()
 
     def load(self) -> Any:
         """Import the target. Raises PluginError that names the distribution."""
         module_name, _, attribute = self.target.partition(":")
         try:
-            with prints_to_stderr(), self.held():
+            with prints_to_stderr(), self.held(imports=True):
                 found: Any = importlib.import_module(module_name)
                 for part in attribute.split("."):
                     found = getattr(found, part)

@@ -41,12 +41,13 @@ _told: set[str] = set()
 
 
 @contextlib.contextmanager
-def strangers_code(whose: str, *, registering: str = "", prints: bool = False) -> Iterator[None]:
+def strangers_code(whose: str, *, registering: str = "", imports: bool = False, prints: bool = False) -> Iterator[None]:
     """Let a block of a stranger's code touch nothing but itself.
 
     whose           how messages name it, "metric 'sharp' of sw-theirs 0.2"
     registering     top-level module of a plugin that is imported, or whose hook adds entries: then random numbers and
                     threads are told too, and it may take no longer than PATIENCE
+    imports         a target is imported: it is told after PATIENCE
     prints          stdout is its own
 
     What it raises comes out, os._exit as ProcessExit, and what is no Exception and was not asked for from outside (a
@@ -68,6 +69,7 @@ def strangers_code(whose: str, *, registering: str = "", prints: bool = False) -
         stack.enter_context(exits_are_raised())
         if registering:
             stack.enter_context(_threads_that_end(tell))
+        if registering or imports:
             stack.enter_context(_limited(tell, registering))
         try:
             yield
@@ -175,17 +177,17 @@ def _threads_that_end(tell: Any) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _limited(tell: Any, package: str) -> Iterator[None]:
-    """Raise TooLongError in a block that takes longer than PATIENCE.
+    """Raise TooLongError in a block that imports `package` and takes longer than PATIENCE; "": it is only told.
 
-    While it imports another package it is only told: half an import of torch would take torch from everybody.
+    So while it imports another package: half an import of torch would take torch from everybody.
     """
     if not hasattr(signal, "setitimer") or threading.current_thread() is not threading.main_thread():
         yield
         return
 
     def look(_number: int, frame: Any) -> None:
-        tell(f"is being registered for {PATIENCE:.0f} s")
-        stops = frame is not None and not frame.f_code.co_filename.startswith("<frozen importlib")
+        tell(f"is being imported for {PATIENCE:.0f} s")
+        stops = bool(package) and frame is not None and not frame.f_code.co_filename.startswith("<frozen importlib")
         while frame is not None and (name := frame.f_globals.get("__name__", "")) not in CALLERS:
             stops &= frame.f_code.co_name != "<module>" or name.partition(".")[0] == package
             frame = frame.f_back
