@@ -92,6 +92,7 @@ def evaluated(tmp_path_factory: pytest.TempPathFactory):
         site.install(name, lazy_metric(name), **target)
     for name, (body, _) in {**METRICS, **CHANGING}.items():
         site.install(name, metric(name.removeprefix("sw-"), name.replace("-", "_"), body))
+    site.install("sw-sleeps", BROKEN["sw-sleeps"][0])
     run = ("run", "--scene", "demo:tiny", "--set", "iterations=4", "--set", "eval_every=2", "--out", "out")
     return site.sw(*run, "--json")
 
@@ -102,6 +103,10 @@ def test_the_state_of_torch_is_put_back_and_its_metric_named(evaluated, name):
     assert record["metrics"][name.removeprefix("sw-")]["mean"] == 1.0
     said = {**TARGETS, **CHANGING}[name][1]
     assert [line for line in lines_about(name, evaluated.stderr) if said in line]
+
+
+def test_the_processes_of_a_run_wait_once_for_one_that_does_not_come_back(evaluated):
+    assert len(lines_about("sw-sleeps", evaluated.stderr)) == 1
 
 
 @pytest.mark.parametrize("name", METRICS)

@@ -22,6 +22,7 @@ log = logging.getLogger(__name__)
 
 PATIENCE, AGAIN = 3.0, 0.25
 """Seconds that registering may take (milliseconds are usual), and until what could not be stopped then is stopped."""
+LATE = "_SW_LATE"  # variable with those that took too long: processes that are started wait for none of them again
 CALLERS = ("splatwizard_core.plugins.manager", "splatwizard_core.plugins.guards")
 STREAMS = {"stdin": 0, "stdout": 1, "stderr": 2, "__stdin__": 0, "__stdout__": 1, "__stderr__": 2}
 
@@ -62,6 +63,8 @@ def strangers_code(whose: str, *, registering: str = "", imports: bool = False, 
     def changes(what: str) -> None:
         tell(f"changes {what}: it is put back")
 
+    if registering and whose in os.environ.get(LATE, "").split("\n"):
+        raise PluginError(f"registering took more than {PATIENCE:.0f} s in the command that started this one")
     with contextlib.ExitStack() as stack:
         stack.enter_context(_kept_streams(tell, looks=bool(registering), prints=prints))
         stack.enter_context(kept_state(changes, tells_seeds=bool(registering)))
@@ -74,6 +77,7 @@ def strangers_code(whose: str, *, registering: str = "", imports: bool = False, 
         try:
             yield
         except TooLongError as error:
+            os.environ[LATE] = "\n".join([whose, *filter(None, [os.environ.get(LATE)])])
             late = f"registering takes more than {PATIENCE:.0f} s, and every command would wait for it"
             raise PluginError(late) from error
         except BaseException as error:
