@@ -32,7 +32,8 @@ class Drawing:
     def render(self, camera: Camera, options: RasterOptions | None = None) -> RenderResult:
         """Draw one view, without gradients; `options` None: as the file asks. Raises CapabilityError."""
         result = render_view(self.model, camera.to(self.device), self.rasterizer, options or self.options)
-        self.rasterizer.look(result)
+        if isinstance(self.rasterizer, NegotiatedRasterizer):
+            self.rasterizer.look(result)
         return result
 
     def has_surfels(self, camera: Camera) -> bool:
