@@ -1,6 +1,6 @@
 """Small records beside the published figures of the scene that they were cut down from: `table published SCENE`.
 
-Figures are those of sw-report (published.json), of the same method and rate point. Runs of the preset that a figure is
+Figures are those of the method's package (published.toml), of the same rate point. Runs of the preset that a figure is
 to be measured by come first, then those of `paper`, and the table says which.
 """
 
@@ -11,26 +11,36 @@ from pathlib import Path
 
 from result_groups import BASE, NONE, TITLES, Rows, points, spread
 from result_records import FROM, RECORDS, SmallRecord, read
-from sw_report.published import Figure, read_published, standing_for
+from sw_report.published import standing_for
+from sw_report.published_files import Figure, read_published
 
-FULL_SCENES = {"lego": "nerf_synthetic"}  # scene of the records -> data set whose scene of that name it is made from
+SCENES = {"lego": ("nerf_synthetic", ["lego"]), "chair": ("nerf_synthetic", ["chair", "chair-black"])}
+"""Published scene -> its data set, and the records of it, or of what is cut down from it."""
 HEAD = (
-    "method", "rate", "PSNR dB, published", "here", "SSIM, published", "here", "bytes, published", "here",
-    "Gaussians, published", "here", "n", "source", "differs besides",
+    "method", "rate", "PSNR dB, published", "here", "SSIM, published", "here", "LPIPS, published", "here",
+    "bytes, published", "here", "Gaussians, published", "here", "n", "source", "differs besides",
 )  # fmt: skip
 
 
-def table(scene: str, records_at: Path = RECORDS) -> str:
+BRIEF = {"method": 0, "rate": 1, "PSNR dB": 3, "published": 2, "bytes": 9, "published bytes": 8, "n": 12}
+"""Column of the short form -> its place in a whole row."""
+
+
+def table(scene: str, records_at: Path = RECORDS, *, brief: bool = False) -> str:
     """Write a row for each published figure with records. Raises SystemExit for a scene of no data set."""
-    if scene not in FULL_SCENES:
-        raise SystemExit(f"no published scene is known for '{scene}'; one of {', '.join(FULL_SCENES)}")
-    records = read(records_at / f"{scene}.jsonl")
-    figures = [f for f in read_published() if (f.dataset, f.scene) == (FULL_SCENES[scene], scene) and f.rate]
+    if scene not in SCENES:
+        raise SystemExit(f"no published scene is known for '{scene}'; one of {', '.join(SCENES)}")
+    dataset, names = SCENES[scene]
+    records = [record for name in names for record in read(records_at / f"{name}.jsonl")]
+    figures = [f for f in read_published() if (f.dataset, f.scene) == (dataset, scene) and f.rate]
     order = list(TITLES)
     figures.sort(key=lambda f: (order.index(f.method) if f.method in order else len(order), -(f.bytes or 0)))
     rows = [_row(figure, group, records) for figure in figures if (group := _group(figure, records))]
-    lines = [f"| {' | '.join(cells)} |" for cells in (HEAD, *rows)]
-    return "\n".join([lines[0], "|---" * len(HEAD) + "|", *lines[1:], ""])
+    whole: Sequence[Sequence[str]] = [HEAD, *rows]
+    if brief:
+        whole = [list(BRIEF), *([row[place] for place in BRIEF.values()] for row in rows)]
+    lines = [f"| {' | '.join(cells)} |" for cells in whole]
+    return "\n".join([lines[0], "|---" * len(whole[0]) + "|", *lines[1:], ""])
 
 
 def _group(figure: Figure, records: Rows) -> Rows:
@@ -46,6 +56,7 @@ def _row(figure: Figure, group: Rows, records: Rows) -> list[str]:
         TITLES.get(figure.method, figure.method), figure.rate or NONE,
         _shown(figure.psnr, 2), spread([r.psnr for r in group], 2),
         _shown(figure.ssim, 4), spread([r.ssim for r in group], 4),
+        _shown(figure.lpips, 4), spread([r.lpips for r in group], 4),
         _shown(figure.bytes, 0), spread([r.bytes for r in group], 0),
         _shown(figure.gaussians, 0), spread([r.gaussians for r in group], 0), str(len(group)),
         f"{figure.source}, {figure.year}{'' if figure.verified or 're-read' in figure.source else ' (not re-read)'}",
@@ -61,7 +72,7 @@ def _differences(figure: Figure, group: Rows, records: Rows) -> list[str]:
         found.append("background not stated there")
     elif here not in (published if isinstance(published, list) else [published]):
         found.append(f"background {here} here, {published} there")
-    if first.preset != figure.preset:
+    if figure.preset not in (None, first.preset):
         found.append(f"preset {first.preset} here, {figure.preset} there")
     steps = _all_steps(first, records)
     if None not in (steps, figure.steps) and steps != figure.steps:
