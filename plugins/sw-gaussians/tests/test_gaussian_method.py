@@ -12,6 +12,7 @@ from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import BitstreamError, ConfigError, PluginError, SceneError
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins.registry import Coders, Registry
+from splatwizard_core.scene.scene import PointCloud
 from splatwizard_core.training.params import OptimizationParams
 
 SHAPES = {"means": (3,), "sh_dc": (1, 3), "sh_rest": (0, 3), "opacity_logits": (), "log_scales": (3,), "quats": (4,)}
@@ -102,6 +103,26 @@ def test_what_is_no_set_of_gaussians_is_no_file(plugins):
         written(plugins, torch.nn.Linear(1, 1))
 
 
-def test_a_method_without_a_start_of_its_own_refuses_points(plugins):
+def test_a_method_starts_from_points_where_no_stage_starts_from_a_trained_scene(plugins):
+    class FromPoints(Toy):
+        def stages(self):
+            return [SimpleNamespace(starts_from=None)]
+
+    xyz = torch.randn(20, 3, generator=torch.Generator().manual_seed(0))
+    scene = SimpleNamespace(name="s", path="somewhere", points=PointCloud(xyz))
+    model = FromPoints(plugins, ToyConfig()).create_model(scene, None)
+    assert torch.equal(model.means, xyz)
+    assert model.max_sh_degree == 3
+
+    class Flat(ToyConfig):
+        sh_degree: int = 1
+
+    assert FromPoints(plugins, Flat()).create_model(scene, None).max_sh_degree == 1
+    scene.points = None
+    with pytest.raises(SceneError, match="has no start points: toy needs SfM points"):
+        FromPoints(plugins, ToyConfig()).create_model(scene, None)
+
+
+def test_a_method_whose_stage_starts_from_a_trained_scene_refuses_points(plugins):
     with pytest.raises(SceneError, match="toy starts from a trained gaussians-of-old scene"):
         Toy(plugins, ToyConfig()).create_model(SimpleNamespace(path="somewhere"), None)

@@ -327,8 +327,14 @@ class BadMethod(Method):
     def stages(self):
         return [Stage(self.config)]
 
+    def create_model(self, scene, generator):
+        return some_gaussians()
+
     def encode(self, model, writer):
         model.means.data += 1
+
+    def decode(self, reader):
+        return some_gaussians()
 
 
 class BadTask(Stage):
@@ -346,6 +352,9 @@ class BadTask(Stage):
      ({"DEFAULT_RATE": "r9"}, {}, "DEFAULT_RATE is 'r9'"), ({"Config": Config}, {}, "no description of strength"),
      ({"RATES": {"r1": {"no_such_key": 1}}}, {}, "no_such_key"),
      ({"stages": lambda self: []}, {}, "return one or more"),
+     ({"stages": Method.stages}, {}, r"no stages\(\) -> def stages\(self\): return"),
+     ({"decode": Method.decode}, {}, r"no decode\(\) -> def decode\(self, reader\): a model"),
+     ({"create_model": Method.create_model}, {}, r"no create_model\(\), .* -> def create_model\(self, scene"),
      ({"stages": lambda self: [BadTask(self.config)]}, {}, "'model'")],
 )  # fmt: skip
 def test_declarations_of_a_method_that_do_not_fit_it(entry_of, changes, declared, said):

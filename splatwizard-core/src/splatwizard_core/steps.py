@@ -79,4 +79,6 @@ def render(opened: Opened, view: api.View, **options: Any) -> api.RenderResult:
     session, resolved = _session({"device": opened.model.device.type})
     rasterizer = session.rasterizer(resolved, quality.suggested_rasterizers(opened.raster))
     asked = replace(quality.render_options(opened.raster, None), **options)
-    return quality.render_view(opened.model, view.camera.to(session.device), rasterizer, asked)
+    found = quality.render_view(opened.model, view.camera.to(session.device), rasterizer, asked)
+    rasterizer.look(found)
+    return found

@@ -20,6 +20,7 @@ class ThreeDGSConfig(Choosing, GaussianTraining):
     OLDER: ClassVar[Mapping[str, Moved]] = {
         f"codec.{name}": Moved((f"codec.settings.{name}",), field.default, MODES["quantized"])
         for name, field in QuantizedSettings.model_fields.items()
+        if name not in QuantizedSettings.USUAL
     }
 
     sh_degree: int = Field(3, ge=0, le=3, description="highest degree of the spherical harmonics")

@@ -14,7 +14,7 @@ Gaussians along a Morton curve, entries of codebooks by their first use:
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,13 +24,14 @@ from splatwizard_core.api import BitstreamError, GaussianModel, Params, Splatwiz
 from sw_c3dgs.coded import QUANTIZED, CodedGaussians
 from sw_c3dgs.indexed import IndexedGaussians
 from sw_c3dgs.model import SharedGaussians
+from sw_codecs.models.exchangeable import codes_arrays, hold_part
 from sw_codecs.positions.ordering import box_cells, spatial_order
 from sw_codecs.vectors.sensitivity_vq import index_dtype
 
 if TYPE_CHECKING:
     from splatwizard_core.api import ArrayCoder, ContainerReader, ContainerWriter, PluginManager
 
-CODERS = ("deflate", "byte-planes")
+TRIED = ("deflate", "byte-planes")
 MAX_ZERO = 1 << 20  # of the quantizer
 MAX_LOG_FACTOR = 80.0  # exp stays within float32
 
@@ -38,8 +39,8 @@ MAX_LOG_FACTOR = 80.0  # exp stays within float32
 class Settings(Params):
     """Settings of the codec."""
 
-    arrays: Literal["deflate", "byte-planes"] = Field(
-        "deflate", description="coder of every array: as published, or the one that is shorter for most"
+    arrays: str = Field(
+        "deflate", description="coder of every array: as published; byte-planes is shorter for most, others do too"
     )
 
 
@@ -50,6 +51,8 @@ class IndexedCodec:
 
     def __init__(self, plugins: PluginManager, **settings: Any) -> None:
         self.plugins, self.settings = plugins, Settings(**settings)
+        if self.settings.arrays not in TRIED:
+            hold_part(plugins.array_coders, self.settings.arrays, "codec.settings.arrays", codes_arrays)
 
     def encode(self, model: GaussianModel, writer: ContainerWriter) -> None:
         """Write the sections. Raises SplatwizardError for values that are not finite or far too large."""
@@ -83,7 +86,7 @@ class IndexedCodec:
         colors = reader.integer("num_colors", low=min(n, 1), high=n)
         shapes = reader.integer("num_shapes", low=min(n, 1), high=n)
         bands = (reader.integer("max_sh_degree", low=0, high=3) + 1) ** 2
-        coder = self.plugins.array_coders.load(reader.text("arrays", choices=CODERS))()
+        coder = self.plugins.array_coders.load(reader.text("arrays", choices=self.plugins.array_coders.names))()
         reader.allow(_decoded_bytes(n, colors, shapes, bands), f"a model of {n:,} Gaussians")
         with reader.decoding("xyz") as data:
             means = coder.decode(data, np.float16, (n, 3))

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from splatwizard_core.api import GaussianModel, Method, PluginError, SceneError
 from sw_gaussians.choices import CodecChoice
+from sw_gaussians.start import gaussians_from_points, start_points
 from sw_gaussians.surfels import SurfelModel, state_surface, stated_surface
 
 if TYPE_CHECKING:
@@ -27,12 +28,13 @@ HEADER_KEY = "codec"
 class GaussianMethod(Method):
     """Base of methods that leave it to a codec how their Gaussians are written, as those do that only prune.
 
-    A subclass says in `stages` how it trains; its Config is a `Choosing` with a block `codec`, a `CodecChoice`. Its
-    first stage starts from a trained scene, or it has a `create_model` of its own.
+    A subclass says in `stages` how it trains; its Config is a `Choosing` with a block `codec`, a `CodecChoice`. It
+    starts from a trained scene where its first stage does, else from the scene's points; one that starts otherwise
+    has a `create_model` of its own.
     """
 
     def __init__(self, plugins: PluginManager, config: OptimizationParams | None) -> None:
-        """Raise ConfigError for a codec that is not installed: now, and not when all is trained."""
+        """Raise ConfigError for a codec or a part of it that is not installed: now, and not when all is trained."""
         super().__init__(plugins, config)
         if config is None:
             return
@@ -42,13 +44,18 @@ class GaussianMethod(Method):
                 f"method '{self.name}' cannot be used: `codec` of its {type(config).__name__} must be a CodecChoice of "
                 "sw_gaussians.choices; its author has to change that"
             )
-        codec.provider(plugins, "codec.name")
+        codec.provider(plugins, "codec.name")(plugins, **codec.settings)
 
     def create_model(self, scene: Scene, generator: torch.Generator) -> SplatModel:
-        """Raise SceneError: a stage starts from a trained scene, and there is no start from points."""
+        """Return one Gaussian for each start point, with bands up to `sh_degree` of the config, or 3.
+
+        Raises SceneError for a scene without points, or where a stage starts from a trained scene.
+        """
         named = next((stage.starts_from for stage in self.stages() if stage.starts_from is not None), None)
-        start = f"a trained {named} scene" if named is not None else "a trained scene"
-        raise SceneError(f"{self.name} starts from {start}, not from points", path=scene.path)
+        if named is not None:
+            raise SceneError(f"{self.name} starts from a trained {named} scene, not from points", path=scene.path)
+        points = start_points(scene, self.name)
+        return gaussians_from_points(points, max_sh_degree=getattr(self.config, "sh_degree", 3))
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         """Write `model` with the chosen codec, whose name goes into the header.

@@ -31,7 +31,10 @@ class Drawing:
 
     def render(self, camera: Camera, options: RasterOptions | None = None) -> RenderResult:
         """Draw one view, without gradients; `options` None: as the file asks. Raises CapabilityError."""
-        return render_view(self.model, camera.to(self.device), self.rasterizer, options or self.options)
+        result = render_view(self.model, camera.to(self.device), self.rasterizer, options or self.options)
+        if isinstance(self.rasterizer, NegotiatedRasterizer):
+            self.rasterizer.look(result)
+        return result
 
     def has_surfels(self, camera: Camera) -> bool:
         """Whether what a camera sees is drawn as flat Gaussians (scales [N,2]), which have normals of their own."""

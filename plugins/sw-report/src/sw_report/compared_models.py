@@ -39,6 +39,8 @@ class OpenedFile:
     def picture(self, camera: Camera) -> Tensor:
         """[3,H,W] in 0 .. 1."""
         found = render_view(self.model, camera.to(self.model.device), self.rasterizer, self.options)
+        if isinstance(self.rasterizer, NegotiatedRasterizer):
+            self.rasterizer.look(found)
         return found.image.clamp(0, 1)
 
     def facts(self) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from splatwizard_core.errors import PluginError, TaskError
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.plugins.catalogue import package_of
 from splatwizard_core.plugins.origins import Origins
+from splatwizard_core.plugins.strangers_code import exits_are_raised
 from splatwizard_native import FULL, DiskFullError, ForeseenError, shortened
 
 if TYPE_CHECKING:
@@ -112,7 +113,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     logging.basicConfig(level=logging.DEBUG if debug else logging.WARNING, format="%(levelname)s: %(message)s")
     for noisy in ("PIL", "torch", "matplotlib"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
-    with ended_like_ctrl_c():
+    with ended_like_ctrl_c(), exits_are_raised():
         try:
             status = cli.main(args=arguments, prog_name="sw", standalone_mode=False)
         except BaseException as error:
@@ -126,7 +127,7 @@ def _report(error: BaseException, arguments: Sequence[str], *, debug: bool) -> i
         return error.exit_status  # the shell asks for completions: TAB is not the place to say what is wrong
     culprit = _culprit(error, arguments)
     if isinstance(error, SystemExit) and culprit:
-        _say(f"error: SystemExit: {error}{culprit}")
+        _say(f"error: {type(error).__name__}: {error}{culprit}")
         return 1
     if isinstance(error, SystemExit):
         return error.code if isinstance(error.code, int) else int(error.code is not None)

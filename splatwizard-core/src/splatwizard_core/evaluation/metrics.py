@@ -221,7 +221,8 @@ def noting_failure(entry: Entry, reasons: dict[str, str]) -> Iterator[None]:
     Raises the error itself if it is for the user (damaged weights), or about a GPU without memory; not a stranger's.
     """
     try:
-        yield
+        with entry.held():
+            yield
     except (PluginError, CapabilityError) as error:
         reasons[entry.name] = str(error)
     except (Exception, SystemExit) as error:
@@ -238,7 +239,8 @@ def metric_identities(entries: Iterable[Entry], setup: MetricSetup) -> dict[str,
         try:
             target = entry.load()
             if hasattr(target, "identity"):
-                identity = target.identity(setup)
+                with entry.held():
+                    identity = target.identity(setup)
                 found[entry.name] = None if identity is None else f"{package}, {identity}"
         except (Exception, SystemExit):
             found[entry.name] = None

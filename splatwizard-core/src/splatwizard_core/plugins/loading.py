@@ -6,6 +6,8 @@ import contextlib
 import functools
 import importlib.metadata
 import logging
+import os
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from email.message import Message
@@ -13,8 +15,9 @@ from email.parser import HeaderParser
 
 from packaging.requirements import InvalidRequirement, Requirement
 
-from splatwizard_core.plugins.catalogue import is_ours, normal_name, our_distributions
+from splatwizard_core.plugins.catalogue import CORE, is_ours, normal_name, our_distributions
 from splatwizard_core.plugins.guards import one_line
+from splatwizard_core.plugins.migration import CHANGED, PAGE, written_for
 
 log = logging.getLogger(__name__)
 
@@ -68,6 +71,23 @@ def installed_entry_points(group: str) -> list[importlib.metadata.EntryPoint]:
         return found
 
 
+def shadowed() -> list[str]:
+    """Return a line about each distribution of ours that lies on the path twice, or once more in a stranger's files."""
+    places: dict[str, dict[tuple[str, str], None]] = {}
+    for folder in dict.fromkeys(sys.path):
+        with contextlib.suppress(OSError):  # a zip file, a folder that is gone
+            for name in sorted(os.listdir(folder or ".")):
+                if name.endswith((".dist-info", ".egg-info")):
+                    distribution, _, version = name.rpartition(".")[0].partition("-")
+                    places.setdefault(normal_name(distribution), {})[folder, version] = None
+    told = []
+    for name in sorted(our_distributions() & places.keys()):
+        (first, used), *others = places[name]
+        for folder, version in others:
+            told.append(f"{name} {used} in {first} hides {name} {version} in {folder}: remove the wrong one")
+    return told
+
+
 def taken_key(info: PluginInfo, plugins: Sequence[PluginInfo]) -> str | None:
     """One line about whose the name of a stranger's entry point is; None: its own."""
     key = normal_name(info.key)
@@ -77,6 +97,16 @@ def taken_key(info: PluginInfo, plugins: Sequence[PluginInfo]) -> str | None:
         return None
     cure = f"uninstall {info.distribution}, or have its author rename it" if ours else "uninstall one of them"
     return f"its entry point is called '{info.key}', which is the name of {ours or ' and '.join(others)}: {cure}"
+
+
+def taken_module(dist: importlib.metadata.Distribution | None) -> str | None:
+    """One line about a module of ours that a stranger's distribution brings; None: it brings none."""
+    with contextlib.suppress(UnicodeDecodeError, OSError):
+        brought = {line.partition("/")[0] for line in ((dist and dist.read_text("RECORD")) or "").splitlines()}
+        for ours in sorted(name for name in our_distributions() if name.replace("-", "_") in brought):
+            module, name = ours.replace("-", "_"), _header(dist)["Name"]
+            return f"it brings the module {module}, that of {ours}: uninstall {name}, then install {ours} again"
+    return None
 
 
 def names_of(entry_point: importlib.metadata.EntryPoint) -> set[str]:
@@ -90,7 +120,7 @@ def unmet_requirement(dist: importlib.metadata.Distribution | None) -> str | Non
         try:
             requirement = Requirement(text)
         except InvalidRequirement:
-            continue
+            return f"its metadata requires {text[:80]!r}, which cannot be read: have its author mend `dependencies`"
         if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
             continue
         try:
@@ -99,6 +129,9 @@ def unmet_requirement(dist: importlib.metadata.Distribution | None) -> str | Non
             return f"needs {requirement.name}, which is not installed: pip install {requirement.name}"
         if not requirement.specifier.contains(version, prereleases=True):
             wanted = f"{requirement.name}{requirement.specifier}"
+            if normal_name(requirement.name) == CORE and (contract := written_for([text])):
+                ways = f"pip install --upgrade {_header(dist)['Name']}"
+                return f"it is written for {CORE} {contract} ({wanted}), here is {version}: {CHANGED} ({PAGE}): {ways}"
             return f"needs {wanted}, but {version} is installed: pip install '{wanted}'"
     return None
 

@@ -17,7 +17,9 @@ from splatwizard_core.plugins import hookspecs, loading
 from splatwizard_core.plugins.catalogue import normal_name
 from splatwizard_core.plugins.guards import guarded_hooks, one_line, prints_to_stderr
 from splatwizard_core.plugins.loading import PluginInfo
+from splatwizard_core.plugins.migration import migration_hint
 from splatwizard_core.plugins.registry import Coders, Entry, Registry, TypedRegistry
+from splatwizard_core.plugins.strangers_code import strangers_code
 from splatwizard_native import ForeseenError
 
 if TYPE_CHECKING:
@@ -101,9 +103,10 @@ class PluginManager:
         hooks = None
         try:
             obstacle = loading.taken_key(info, self.plugins) or loading.unmet_requirement(entry_point.dist)
+            obstacle = obstacle or (loading.taken_module(entry_point.dist) if info.foreign else None)
             if obstacle is not None:
                 raise PluginError(obstacle)
-            with prints_to_stderr():
+            with self._held(info, registering=True):
                 module = entry_point.load()
             hooks = guarded_hooks(module, self._pluggy, functools.partial(self._guard, info))
             self._pluggy.register(hooks)
@@ -112,7 +115,7 @@ class PluginManager:
         except (Exception, SystemExit) as error:  # a module that exits when it is imported must not end `sw`
             if self._pluggy.is_registered(hooks):  # with some of its hooks
                 self._pluggy.unregister(hooks)
-            info.error = one_line(error)
+            info.error = one_line(error) + migration_hint(info.distribution, error)
             log.debug("plugin %s could not be loaded", info.distribution, exc_info=True)
 
     @contextlib.contextmanager
@@ -126,24 +129,34 @@ class PluginManager:
             if isinstance(argument, Registry):
                 argument._owner = (info.distribution, info.version, info.foreign)
         try:
-            with contextlib.nullcontext() if hook == "run_finished" else prints_to_stderr():  # that one prints tables
+            with self._held(info, registering=registering, prints=hook == "run_finished"):  # that one prints tables
                 yield
         except (Exception, SystemExit) as error:
             log.debug("plugin %s: %s failed", info.distribution, hook, exc_info=True)
             if not registering:
                 log.warning("%s %s: %s failed: %s", info.distribution, info.version, hook, one_line(error))
                 return
-            info.error = f"{hook}: {one_line(error)}"
+            info.error = f"{hook}: {one_line(error)}{migration_hint(info.distribution, error)}"
+
+    @staticmethod
+    def _held(info: PluginInfo, *, registering: bool, prints: bool = False) -> contextlib.AbstractContextManager[Any]:
+        """Around a plugin's module and hooks: what it prints stands in no output; a stranger changes nothing else."""
+        if not info.foreign:
+            return contextlib.nullcontext() if prints else prints_to_stderr()
+        whose, package = f"{info.distribution} {info.version}", info.module.partition(":")[0].partition(".")[0]
+        return strangers_code(whose, registering=package if registering else "", prints=prints)
 
     @contextlib.contextmanager
     def guarding(self, registry: Registry, name: str) -> Iterator[None]:
         """Make whatever an entry raises that is no error for users a PluginError that names its distribution."""
+        entry = registry.entry(name)
         try:
-            yield
+            with entry.held():
+                yield
         except (ForeseenError, OSError):
             raise
         except (Exception, SystemExit) as error:
-            raise PluginError(f"{registry.entry(name).whose} failed: {one_line(error)}") from error
+            raise PluginError(f"{entry.whose} failed: {one_line(error)}") from error
 
     def read_gaussians(self, path: Path) -> GaussianModel:
         """Read explicit Gaussians by the importer whose suffix `path` has, else as .ply. Raises UserInputError."""
@@ -214,4 +227,6 @@ def load_plugins() -> PluginManager:
     """
     names = os.environ.get("SW_PLUGINS")
     only = None if names is None else {n.strip() for n in names.split(",") if n.strip()}
+    for line in loading.shadowed():
+        log.warning("%s", line)
     return PluginManager(loading.installed_entry_points(hookspecs.ENTRY_POINT_GROUP), only)

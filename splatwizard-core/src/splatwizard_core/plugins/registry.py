@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import importlib
 from collections.abc import Callable, Iterator, Mapping
@@ -13,6 +14,8 @@ from splatwizard_core.errors import PluginError
 from splatwizard_core.plugins.catalogue import catalogue, is_ours, package_of
 from splatwizard_core.plugins.fields import illegal
 from splatwizard_core.plugins.guards import prints_to_stderr
+from splatwizard_core.plugins.migration import migration_hint
+from splatwizard_core.plugins.strangers_code import strangers_code
 
 T = TypeVar("T")
 
@@ -46,16 +49,20 @@ class Entry:
         """`metric 'sharpness' of sw-theirs 0.2`: how a message names it."""
         return f"{self.kind} '{self.name}' of {self.distribution} {self.version}"
 
+    def held(self, *, imports: bool = False) -> contextlib.AbstractContextManager[Any]:
+        """A context for code of this entry: a stranger's is kept from changing what is not its own."""
+        return strangers_code(self.whose, imports=imports) if self.foreign else contextlib.nullcontext()
+
     def load(self) -> Any:
         """Import the target. Raises PluginError that names the distribution."""
         module_name, _, attribute = self.target.partition(":")
         try:
-            with prints_to_stderr():
+            with prints_to_stderr(), self.held(imports=True):
                 found: Any = importlib.import_module(module_name)
                 for part in attribute.split("."):
                     found = getattr(found, part)
         except (Exception, SystemExit) as error:
-            why = f"{type(error).__name__}: {error}"
+            why = f"{type(error).__name__}: {error}{migration_hint(self.distribution, error)}"
             raise PluginError(f"{self.whose} could not be loaded from {self.target}: {why}") from error
         own = getattr(found, "name", self.name)
         if self.kind == "method" and own != self.name:  # files and records would name what nobody can ask for

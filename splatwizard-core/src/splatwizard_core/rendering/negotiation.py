@@ -21,6 +21,7 @@ from splatwizard_core.plugins.manager import PluginManager
 from splatwizard_core.plugins.registry import Entry
 from splatwizard_core.rendering.adapters import AdaptedRasterizer, adapted_requirements
 from splatwizard_core.rendering.features import Feature
+from splatwizard_core.rendering.held import faults
 from splatwizard_core.rendering.info import RasterizerInfo
 from splatwizard_core.rendering.rasterizer import AccumOutput, Rasterizer, RasterOptions, RenderResult
 from splatwizard_core.scene.camera import Camera
@@ -99,8 +100,24 @@ class NegotiatedRasterizer:
 
     def render(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> RenderResult:
         """Draw one view with the rasterizer that serves it best. Raises CapabilityError if none does."""
-        opt = self.decided(opt)
-        return self._delegate(Feature.asked_by(opt, g), lambda r: r.render(g, cam, opt), opt.profile)
+        opt, learns = self.decided(opt), torch.is_grad_enabled()
+        result = self._delegate(Feature.asked_by(opt, g), lambda r: r.render(g, cam, opt), opt.profile)
+        self._hold(faults(result, g, cam, opt, learns=learns) if self._strangers else ())
+        return result
+
+    def look(self, result: RenderResult) -> None:
+        """Raise PluginError if a stranger's rasterizer served and the picture holds values that are not finite."""
+        if self._strangers and not bool(result.image.isfinite().all()):
+            self._hold(["its picture holds values that are not finite"])
+
+    @property
+    def _strangers(self) -> list[Entry]:
+        return [entry for entry in self._registry if entry.foreign and entry.name in self.served]
+
+    def _hold(self, found: Iterable[str]) -> None:
+        for fault in found:
+            whose = " or ".join(entry.whose for entry in self._strangers)
+            raise PluginError(f"{whose} breaks its contract: {fault}; raster.prefer names another one")
 
     def visible_filter(self, g: GaussianInputs, cam: Camera) -> Tensor:
         """Radii [N] int32 from geometry alone; 0 = culled."""
@@ -157,7 +174,9 @@ class NegotiatedRasterizer:
         """Import and construct one; whatever a broken package raises becomes a PluginError."""
         entry = self._registry.entry(name)
         try:
-            made: Rasterizer = entry.load()()
+            target = entry.load()
+            with entry.held():
+                made: Rasterizer = target()
             if entry.foreign and made.info.name != name:
                 raise TypeError(f"its info.name is '{made.info.name}'")
         except ForeseenError:

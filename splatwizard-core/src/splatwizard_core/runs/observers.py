@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
+import torch
+
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.plugins.guards import one_line
@@ -69,7 +71,8 @@ def watched_by(
     def tell(call: Callable[[TrainingObserver], None]) -> None:
         for observer in list(watching):
             try:
-                call(observer)
+                with torch.set_grad_enabled(torch.is_grad_enabled()):  # as it was, whatever it does
+                    call(observer)
             except (Exception, SystemExit) as error:
                 log.debug("an observer of the training failed", exc_info=True)
                 watching.remove(observer)

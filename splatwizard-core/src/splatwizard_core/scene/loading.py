@@ -14,7 +14,8 @@ from splatwizard_core.plugins.guards import one_line
 from splatwizard_core.plugins.manager import PluginManager
 from splatwizard_core.scene.dataset import Dataset, SceneOptions
 from splatwizard_core.scene.locate import is_procedural, locate
-from splatwizard_core.scene.scene import Scene
+from splatwizard_core.scene.scene import Scene, View
+from splatwizard_native import ForeseenError
 
 if TYPE_CHECKING:
     from splatwizard_core.scene.locate import Families
@@ -43,14 +44,13 @@ def load_scene(spec: str, options: SceneOptions, plugins: PluginManager) -> Scen
     if package is not None and not os.path.exists(spec):
         raise SceneError(f"scene '{spec}' is read by {package}, which is not installed: pip install {package}")
     if is_procedural(families, name) and not (separator and os.path.exists(spec)):
-        return _family(families, name).load(Path(rest if separator else name), options)
+        return _loaded(families, name, Path(rest if separator else name), options)
     if separator and name in families and not os.path.exists(spec):
-        return _family(families, name).load(locate(rest, families)[0], options)
+        return _loaded(families, name, locate(rest, families)[0], options)
     path, collection = locate(spec, families)
     if collection is not None and collection in families and not is_procedural(families, collection):
-        return _family(families, collection).load(path, options)
-    family = _recognise(path, families)
-    scene = _family(families, family).load(path, options)
+        return _loaded(families, collection, path, options)
+    family, scene = _read(path, options, families)
     if collection is not None and not families.entry(family).declared.get("scenes"):
         scene.protocol = replace(scene.protocol, dataset=collection)
     return scene
@@ -67,17 +67,56 @@ def family_of(spec: str, families: Families) -> str | None:
         return None
 
 
+class _BrokenFamilyError(SceneError):
+    """A stranger's family broke where it should load a scene."""
+
+
+def _read(path: Path, options: SceneOptions, families: Families, without: tuple[str, ...] = ()) -> tuple[str, Scene]:
+    """Read a folder as the family that recognises it best; if that one breaks, as the next one, with a warning."""
+    family = _recognise(path, families, without)
+    try:
+        return family, _loaded(families, family, path, options)
+    except _BrokenFamilyError as error:
+        try:
+            found = _read(path, options, families, (*without, family))
+        except SceneError:
+            raise error from None
+        log.warning("%s; it is read as '%s'", error, found[0])
+        return found
+
+
+def _loaded(families: Families, name: str, path: Path, options: SceneOptions) -> Scene:
+    """Load by one family. Raises SceneError that names a stranger's package, whatever it breaks."""
+    entry, family = families.entry(name), _family(families, name)
+    if not entry.foreign:
+        return family.load(path, options)
+    try:
+        with entry.held():
+            scene: object = family.load(path, options)
+        if not isinstance(scene, Scene):
+            raise TypeError(f"load() gives {type(scene).__name__} for Scene")
+        for views in (scene.train, scene.test):
+            if not (isinstance(views, list) and all(isinstance(view, View) for view in views)):
+                raise TypeError("train and test are no lists of View")
+    except ForeseenError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise _BrokenFamilyError(f"{entry.whose} cannot load {path}: {one_line(error)}", path=str(path)) from error
+    return scene
+
+
 def _family(families: Families, name: str) -> Dataset:
     target = families.load(name)
     return target() if isinstance(target, type) else target
 
 
-def _recognise(path: Path, families: Families) -> str:
+def _recognise(path: Path, families: Families, without: tuple[str, ...] = ()) -> str:
     """Name of the family with the highest detection score. Raises SceneError if none or several claim the path."""
     scores: dict[str, float] = {}
-    for entry in families:
+    for entry in (each for each in families if each.name not in without):
         try:
-            score = float(_family(families, entry.name).detect(path))
+            with entry.held():
+                score = float(_family(families, entry.name).detect(path))
             if not 0 <= score <= 1:
                 raise ValueError(f"detect() gave {score}; it must be in 0..1")
             scores[entry.name] = score

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from splatwizard_core.api import BitstreamError, EntropyModel
 from sw_codecs.models.attributes import MAX_SYMBOL
+from sw_codecs.models.exchangeable import decoded_matrix
 
 MAX_CLASSES = 16
 ROWS_PER_CLASS = 2048
@@ -52,7 +53,7 @@ def encode_band(columns: EntropyModel, symbols: NDArray[np.int32], classes: NDAr
 
 def decode_matrix(columns: EntropyModel, data: bytes, rows: int, width: int) -> NDArray[np.int64]:
     """Symbols [rows,width], each within +-2^30. Raises BitstreamError."""
-    symbols: NDArray[np.int64] = columns.decode(data, (rows, width))
+    symbols: NDArray[np.int64] = decoded_matrix(columns, data, rows, width)
     if symbols.size and not -MAX_SYMBOL <= int(symbols.min()) <= int(symbols.max()) <= MAX_SYMBOL:
         raise BitstreamError("a quantised value is beyond 2^30")
     return symbols

@@ -31,6 +31,7 @@ class Quantized:
 
     def __init__(self, plugins: PluginManager, **settings: Any) -> None:
         self.plugins, self.settings = plugins, QuantizedSettings(**settings)
+        self.settings.check(plugins)
 
     def encode(self, model: GaussianModel, writer: ContainerWriter) -> None:
         quantized.encode(model, writer, self.settings, self.plugins)

@@ -1,4 +1,5 @@
-"""The file in mode `quantized`: positions through the octree codec, all else on a lattice and range coded.
+"""The file in mode `quantized`: positions through the octree codec, all else on a lattice and range coded, or by what
+the settings name in their place.
 
 Rows are in Morton order of their grid cell. Gaussians that can never be drawn (opacity below 1/255, or a parameter that
 is not finite) are left out. The decoder needs integers and exact arithmetic only.
@@ -27,6 +28,7 @@ from sw_codecs.models.band_context import (
     encode_band,
     suitable_classes,
 )
+from sw_codecs.models.exchangeable import Exchangeable, entropy_model, position_codec
 from sw_codecs.models.position_grid import MAX_TOP, PositionGrid
 
 if TYPE_CHECKING:
@@ -96,12 +98,13 @@ class Layout(Params):
 
 def encode(model: GaussianModel, writer: ContainerWriter, settings: QuantizedSettings, plugins: PluginManager) -> None:
     """Sections positions, color, opacity, scales, quats, sh1 .. sh<active degree>."""
-    octree = plugins.position_codecs.load("octree")()
-    layout, cells, symbols = lattice(model, settings, octree.sort)
+    positions = plugins.position_codecs.load(settings.positions)()
+    layout, cells, symbols = lattice(model, settings, positions.sort)
     writer.raster["sh_degree"] = layout.max_sh_degree
     writer.static.update(layout.model_dump(mode="json", exclude_none=True))
-    writer.add("positions", octree.encode(cells, layout.position_bits))
-    columns = plugins.entropy_models.load("columns")()
+    settings.state(writer)
+    writer.add("positions", positions.encode(cells, layout.position_bits))
+    columns = plugins.entropy_models.load(settings.entropy)()
     for name, (start, stop) in layout.sections.items():
         writer.add(name, columns.encode(symbols[:, start:stop], None))
     for band, start, stop in _bands(layout):
@@ -116,12 +119,12 @@ def decode(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
     n = layout.num_gaussians
     reader.allow(layout.decoded_bytes, f"a model of {n:,} Gaussians")
     with reader.decoding("positions") as data:
-        cells = plugins.position_codecs.load("octree")(max_points=n).decode(data)
+        cells = position_codec(reader, plugins, n).decode(data)
         if cells.shape != (n, 3):
             raise BitstreamError(f"holds {len(cells):,} points, header says {n:,}")
         if n and not 0 <= int(cells.min()) <= int(cells.max()) < 1 << layout.position_bits:
             raise BitstreamError(f"a point leaves the grid of {layout.position_bits} bits")
-    columns = plugins.entropy_models.load("columns")()
+    columns = entropy_model(reader, plugins)
     symbols = np.empty((n, layout.base_columns + 3 * ((layout.active_sh_degree + 1) ** 2 - 1)), dtype=np.int32)
     for name, (start, stop) in layout.sections.items():
         with reader.decoding(name) as data:
@@ -215,7 +218,7 @@ def _classes(layout: Layout, band: int, lower: NDArray[np.int32]) -> tuple[NDArr
     return activity_classes(lower, layout.sh_classes), layout.sh_classes
 
 
-BESIDE = ("mode", "codec", "method", "depth_ratio", "lambda_dist", "lambda_normal")
+BESIDE = (*Exchangeable.USUAL, "mode", "codec", "method", "depth_ratio", "lambda_dist", "lambda_normal")
 """Header values that a method keeps beside the codec's own."""
 
 

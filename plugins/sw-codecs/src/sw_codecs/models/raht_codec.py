@@ -12,6 +12,8 @@ Source: MesonGS (arXiv 2409.09756). Sections (docs/bitstream.md), rows in Morton
     index       `columns` of integers [N]: codebook entry of each Gaussian
     codebook    `byte-planes` of float16 [K,D]
 
+`octree` and `columns` are the usual ones; settings name others, and then so does the header.
+
 The decoder computes in float64 with +, -, *, / and square roots alone: it gives the same floats on every machine.
 """
 
@@ -27,6 +29,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatwizard_core.api import BitstreamError, GaussianModel, SplatwizardError
+from sw_codecs.models.exchangeable import Exchangeable, decoded_matrix, entropy_model, position_codec
 from sw_codecs.models.raht_gaussians import CHANNELS, RahtGaussians, settled_copy
 from sw_codecs.models.raht_settings import RahtSettings
 from sw_codecs.models.voxels import Anchor, VoxelGrid
@@ -53,6 +56,7 @@ class Raht:
     def __init__(self, plugins: PluginManager, *, seed: int = 0, **settings: Any) -> None:
         """seed     of the codebook's training."""
         self.plugins, self.seed, self.settings = plugins, seed, RahtSettings(**settings)
+        self.settings.check(plugins)
 
     def encode(self, model: GaussianModel, writer: ContainerWriter) -> None:
         """Write the sections. Gaussians that are not finite are left out.
@@ -62,7 +66,7 @@ class Raht:
         if not isinstance(model, RahtGaussians) or model.grid is None:
             model = settled_copy(model, self.settings, seed=self.seed)
         _check_finite(model)
-        _write(copy.deepcopy(model).cpu(), writer, self.plugins)
+        _write(copy.deepcopy(model).cpu(), writer, self.plugins, self.settings)
 
     def decode(self, reader: ContainerReader) -> GaussianModel:
         """Return the model. Raises BitstreamError."""
@@ -78,11 +82,11 @@ def _check_finite(model: RahtGaussians) -> None:
 
 
 @torch.no_grad()
-def _write(model: RahtGaussians, writer: ContainerWriter, plugins: PluginManager) -> None:
+def _write(model: RahtGaussians, writer: ContainerWriter, plugins: PluginManager, parts: Exchangeable) -> None:
     """Write a settled model that is on the CPU and nobody else's: its codebook entries are renumbered."""
     assert model.grid is not None
     n, degree, grid = model.num_rows, model.max_sh_degree, model.grid
-    octree, columns = plugins.position_codecs.load("octree")(), plugins.entropy_models.load("columns")()
+    octree, columns = plugins.position_codecs.load(parts.positions)(), plugins.entropy_models.load(parts.entropy)()
     planes = plugins.array_coders.load("byte-planes")()
     used, index = torch.unique(model.code, return_inverse=True)
     codebook = model.codebook[used].flatten(1).numpy().clip(-HALF_MAX, HALF_MAX).astype(np.float16)
@@ -94,6 +98,7 @@ def _write(model: RahtGaussians, writer: ContainerWriter, plugins: PluginManager
         num_gaussians=n, max_sh_degree=degree, active_sh_degree=model.active_sh_degree, depth=grid.depth,
         anchor=grid.anchor, bits=model.detail.bits, blocks=model.detail.blocks, codebook_size=len(codebook),
     )  # fmt: skip
+    parts.state(writer)
     writer.add_array("box", np.array([grid.low, grid.high], np.float64))
     writer.add("positions", octree.encode(model.cells.numpy(), grid.depth))
     writer.add_array("mean", coefficients[:1].sum(0).float().numpy())
@@ -118,10 +123,10 @@ def _read(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
     size = reader.integer("codebook_size", low=0, high=1 << 16)
     anchor = reader.text("anchor", choices=get_args(Anchor))
     reader.allow(_decoded_bytes(n, degree), f"a model of {n:,} Gaussians")
-    columns, planes = plugins.entropy_models.load("columns")(), plugins.array_coders.load("byte-planes")()
+    columns, planes = entropy_model(reader, plugins), plugins.array_coders.load("byte-planes")()
     low, high = reader.array("box", dtype="float64", shape=(2, 3), finite=True).tolist()
     with reader.decoding("positions") as data:
-        cells = plugins.position_codecs.load("octree")(max_points=n).decode(data)
+        cells = position_codec(reader, plugins, n).decode(data)
         codes = morton.encode(cells)
         if len(cells) != n or (codes[1:] == codes[:-1]).any():
             raise BitstreamError(f"holds {len(np.unique(codes)):,} voxels, header says {n:,}")
@@ -132,14 +137,14 @@ def _read(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
     with reader.decoding("steps") as data:
         steps = planes.decode(data, np.float32, (blocks, COLUMNS))
     with reader.decoding("zeros") as data:
-        zeros = columns.decode(data, (blocks, COLUMNS))
+        zeros = decoded_matrix(columns, data, blocks, COLUMNS)
         if not 0 <= int(zeros.min()) <= int(zeros.max()) < 1 << bits:
             raise BitstreamError(f"a zero is no integer of {bits} bits")
     mean = reader.array("mean", dtype="float32", shape=(CHANNELS,), finite=True)
 
     def lattice(section: str, rows: int, start: int, stop: int) -> Tensor:
         with reader.decoding(section) as data:
-            symbols = columns.decode(data, (rows, stop - start)) + _of_rows(zeros[:, start:stop], rows)
+            symbols = decoded_matrix(columns, data, rows, stop - start) + _of_rows(zeros[:, start:stop], rows)
             side = {"scale": steps[:, start:stop], "zero": zeros[:, start:stop], "bits": np.uint8(bits)}
             return FakeQuantAffine.decode(torch.from_numpy(symbols), side)
 
@@ -151,7 +156,7 @@ def _read(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
     if degree:
         bands = (degree + 1) ** 2 - 1
         with reader.decoding("index") as data:
-            index = columns.decode(data, (n,))
+            index = decoded_matrix(columns, data, n)
             if n and not 0 <= int(index.min()) <= int(index.max()) < size:
                 raise BitstreamError(f"an index leaves the codebook of {size:,} entries")
         with reader.decoding("codebook") as data:

@@ -5,6 +5,7 @@ from typing import Literal
 from pydantic import Field
 
 from splatwizard_core.api import Params
+from sw_codecs.models.exchangeable import Exchangeable
 from sw_codecs.models.voxels import Anchor, MergeRule
 
 
@@ -25,7 +26,7 @@ class RahtOptions(Params):
     vq_decay: float = Field(0.8, ge=0, lt=1, description="how much of an entry each batch keeps")
 
 
-class RahtSettings(RahtOptions):
+class RahtSettings(RahtOptions, Exchangeable):
     """Settings of codec `raht`. Defaults: MesonGS (arXiv 2409.09756), where nothing is known of the scene."""
 
     depth: int = Field(20, ge=1, le=21, description="levels of the octree: 2^depth voxels an axis of the bounding box")

@@ -2,11 +2,11 @@
 
 from pydantic import Field
 
-from splatwizard_core.api import Params
+from sw_codecs.models.exchangeable import Exchangeable
 
 
-class QuantizedSettings(Params):
-    """Grid of the positions, and quantiser steps of all else."""
+class QuantizedSettings(Exchangeable):
+    """Grid of the positions, quantiser steps of all else, and what codes both."""
 
     position_bits: int = Field(18, ge=8, le=21, description="bits per axis of the position grid")
     dc_step: float = Field(

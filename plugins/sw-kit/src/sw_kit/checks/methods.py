@@ -14,6 +14,17 @@ if TYPE_CHECKING:
     from splatwizard_core.tooling import Entry
 
 ALWAYS = ("paper", "quick")
+FILE = "or subclass sw_gaussians.method.GaussianMethod, whose file any codec writes"
+NEEDED = {
+    "stages": "def stages(self): return [YourStage(self.config)], a Stage or sw_gaussians.stage.ThreeDGSStage",
+    "encode": f"def encode(self, model, writer): writer.add_array(name, array) for all that decode needs; {FILE}",
+    "decode": f"def decode(self, reader): a model from reader.array(name, ...) alone; {FILE}",
+}
+"""What a method must have -> what to write."""
+START = (
+    "def create_model(self, scene, generator): return gaussians_from_points(start_points(scene, self.name)), both of "
+    "sw_gaussians.start; or subclass GaussianMethod, which does so; or starts_from = '3dgs' in the stage"
+)
 
 
 def check_configuration(entry: Entry, plugins: PluginManager) -> str:
@@ -37,6 +48,8 @@ def check_configuration(entry: Entry, plugins: PluginManager) -> str:
             f"{key} are declared as {declared}, the class has {names}",
             f"registry.add(..., {key}={names})",
         )
+    for function, write in NEEDED.items():
+        hold(getattr(method, function) is not getattr(Method, function), f"it has no {function}()", write)
     missing = [name for name in ALWAYS if name not in presets]
     hold(not missing, f"there is no preset {' and no '.join(missing)}", f"PRESETS = {{'{ALWAYS[0]}': {{}}, ...}}")
     hold(
@@ -56,6 +69,11 @@ def check_configuration(entry: Entry, plugins: PluginManager) -> str:
                 stages and all(isinstance(stage, Stage) for stage in stages),
                 f"stages() of preset '{preset}', rate '{rate}' are {stages}",
                 "return one or more objects of Stage",
+            )
+            hold(
+                stages[0].starts_from or method.create_model is not Method.create_model,
+                f"it has no create_model(), and stage '{stages[0].name}' starts from no trained scene",
+                START,
             )
             for stage in stages:
                 build_schedulers(stage, resolved.ppl)  # raises for a task whose parameters cannot be supplied
