@@ -49,9 +49,9 @@ ROOMS = {
 
 LIBRARIES = {
     "sw_rasterizers", "sw_codecs", "sw_gaussians", "sw_anchors", "sw_finetuning", "sw_reference", "sw_interchange",
-    "sw_render",
+    "sw_render", "sw_report",
 }  # fmt: skip
-"""Packages that others may import when they declare them."""
+"""Packages that others may import when they declare them; of sw_report the file format of published figures alone."""
 ABOUT_RUNS = {
     "sw_bench", "sw_datasets", "sw_doctor", "sw_geometry", "sw_kit", "sw_metrics", "sw_render", "sw_report",
     "sw_viewer",

@@ -1,83 +1,225 @@
-"""benchmarks/published.py: rows are run once, put beside what was published, and missing data is named."""
+"""benchmarks/published.py, anchor_starts.py: cells are run once, by one `sw bench`, and stand beside what is known."""
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import json
+import shutil
+import sqlite3
 import sys
+from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 
 import pytest
+from sw_bench.cells import Layout, cells_of
+from sw_bench.plan import read_plan
 
 from splatwizard_core.plugins import load_plugins
-from splatwizard_core.runs.config import parse_set, resolve
 
-SCRIPT = Path(__file__).parents[1] / "benchmarks" / "published.py"
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 RECORD = {
     "schema_version": 3, "method": "3dgs", "rate": "r6", "preset": "paper", "dataset": "demo", "scene": "demo-tiny",
     "metrics": {"psnr": {"mean": 31.5}, "ssim": {"mean": 0.9}}, "file": {"bytes": 1234}, "test_views": 2,
     "counts": {"num_gaussians": 50}, "train": {"steps": 5}, "protocol": {"id": "demo/64x48", "background": "white"},
 }  # fmt: skip
+NOTHING = {"plan": False, "table": False, "jobs": 0, "gpus": "", "device": "", "deadline": None, "bench": []}
+
+
+def module(name: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    for each in ("sweep_cells", "published", "anchor_starts"):
+        monkeypatch.delitem(sys.modules, each, raising=False)
+    return importlib.import_module(name)
 
 
 @pytest.fixture
 def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    spec = importlib.util.spec_from_file_location("published", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "published", module)
-    spec.loader.exec_module(module)
-    return module
+    return module("published", monkeypatch)
 
 
 @pytest.fixture
-def start(script: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys):
-    """Run the command on three fake rows; returns the commands given to `sw` and what was printed."""
-    content = json.loads(script.ROWS.read_text("utf-8"))
-    real = next(f for f in content["figures"] if (f["method"], f["scene"], f["rate"]) == ("hac", "lego", "r1"))
-    rows = [
-        {**real, "method": "3dgs", "rate": "r6", "scene": "demo:tiny", "dataset": "", "sets": [], "differs": []},
-        {**real, "scene": "absent", "dataset": "nowhere", "verified": False},
-        {**real, "scene": None},
-    ]
-    path = tmp_path / "rows.json"
-
-    def started(*arguments: str, dataset: str = "nowhere") -> tuple[list[list[str]], str]:
-        rows[1] |= {"dataset": dataset, "scene": "absent" if dataset == "nowhere" else real["scene"]}
-        path.write_text(json.dumps({**content, "figures": rows}))
-        given = []
-
-        def run(command, **_):
-            given.append(command[3:])
-            out = Path(command[command.index("--out") + 1])
-            folder = out / "demo-tiny" / "3dgs" / "r6"
-            folder.mkdir(parents=True)
-            (folder / "metrics.json").write_text(json.dumps(RECORD))
-            return SimpleNamespace(returncode=0)
-
-        monkeypatch.setattr(script.subprocess, "run", run)
-        monkeypatch.setattr(sys, "argv", ["published.py", str(tmp_path / "out"), "--rows", str(path), *arguments])
-        assert script.main() == 0
-        return given, capsys.readouterr().out
-
-    return started
+def starts(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    return module("anchor_starts", monkeypatch)
 
 
-def test_a_row_is_run_once_and_stands_beside_what_was_published(start, monkeypatch, tmp_path):
-    monkeypatch.setenv("SPLATWIZARD_DATA", str(tmp_path))
-    given, told = start("--set", "iterations=5")
-    assert [words[:3] for words in given] == [["run", "--method", "3dgs"]]
-    assert given[0][-2:] == ["--set", "iterations=5"]
-    assert "31.50 / 35.04" in told
-    assert "1,234 / 1,313,656" in told
-    assert f"{tmp_path / 'nowhere' / 'absent'} is not there" in told
-    assert "not re-read" in told
-    given, told = start()
-    assert given == []
-    assert "31.50 / 35.04" in told
+@pytest.fixture
+def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """$SPLATWIZARD_DATA with a folder for chair of NeRF Synthetic, which nothing reads."""
+    (tmp_path / "data" / "nerf_synthetic" / "chair").mkdir(parents=True)
+    monkeypatch.setenv("SPLATWIZARD_DATA", str(tmp_path / "data"))
+    return tmp_path / "data"
+
+
+class FakeBench:
+    """`sw bench` without trainings: writes the record of every run of its plan that has none, or lets some fail.
+
+    psnr    (method, rate, seed) -> dB; bytes: rate -> bytes
+    fails   labels that fail
+    """
+
+    def __init__(self, sizes: dict[str, int], fails: tuple[str, ...] = ()) -> None:
+        self.sizes, self.fails = sizes, fails
+        self.commands: list[list[str]] = []
+        self.environments: list[dict[str, str]] = []
+        self.made: list[Path] = []
+
+    def __call__(self, command: list[str], env: dict[str, str]) -> FakeBench:
+        self.commands.append(command[3:])
+        self.environments.append(env)
+        plan, _ = read_plan(command[command.index("bench") + 1])
+        out = Path(command[command.index("--out") + 1])
+        index = sqlite3.connect(out / "bench.sqlite")
+        index.execute("CREATE TABLE IF NOT EXISTS runs (label, scene, seed, rate, status, reason)")
+        for seed in plan.seeds:
+            for label in plan.methods:
+                for scene in plan.scenes:
+                    values = plan.values_for(label, scene, seed)
+                    for rate in (values.rates or "").split(",") if values else ():
+                        if label in self.fails:
+                            row = (label, scene, seed, rate, "failed", "CUDA out of memory")
+                            index.execute("INSERT INTO runs VALUES (?, ?, ?, ?, ?, ?)", row)
+                            continue
+                        self.record(out, plan.method_of(label), label, scene, seed, rate, str(values.preset))
+        index.commit()
+        index.close()
+        return self
+
+    def record(self, out: Path, method: str, label: str, scene: str, seed: int, rate: str, preset: str) -> None:
+        root = f"seed-{seed}" + (f"-{label}" if label != method else "")
+        name = scene.rpartition("/")[2].replace(":", "-")
+        folder = out / root / name / method / rate
+        if (folder / "metrics.json").exists():
+            return
+        folder.mkdir(parents=True)
+        number = int(rate[1:])
+        content = {
+            **RECORD, "method": method, "rate": rate, "preset": preset, "scene": name, "dataset": "nerf_synthetic",
+            "metrics": {"psnr": {"mean": 33.5 + 0.5 * number + 0.05 * seed}}, "file": {"bytes": self.sizes[rate]},
+            "config": {"pipeline": {"seed": seed}},
+        }  # fmt: skip
+        (folder / "metrics.json").write_text(json.dumps(content))
+        self.made.append(folder)
+
+    def wait(self, timeout: float | None = None) -> int:
+        return int(bool(self.fails))
+
+
+SIZES = {f"r{i}": 400_000 * 2**i for i in range(1, 8)}
+
+
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch):
+    """bench(script, *arguments): run a command on a fake `sw bench`; its exit status and that bench."""
+
+    def run(script: ModuleType, *arguments: object, fails: tuple[str, ...] = ()) -> tuple[int, FakeBench]:
+        fake = FakeBench(SIZES, fails)
+        cells = sys.modules["sweep_cells"]
+        monkeypatch.setattr(cells.subprocess, "Popen", fake)
+        monkeypatch.setattr(sys, "argv", ["script.py", *map(str, arguments)])
+        return script.main(), fake
+
+    return run
+
+
+def test_chair_is_run_as_published_with_three_seeds_of_the_hac_family(script):
+    rows = script.rows_of(script.read_published())
+    cells = script.cells_of(rows, script.SEEDS, script.CURVES.split(","), ["c3dgs@r4"])
+    chair = [cell for cell in cells if cell.scene == "nerf_synthetic/chair"]
+    of = {label: {(c.rate, c.seed) for c in chair if c.label == label} for label in {c.label for c in chair}}
+    ends, curve = {(rate, seed) for rate in ("r1", "r5") for seed in range(3)}, {(f"r{i}", 0) for i in (2, 3, 4)}
+    assert of == {
+        "3dgs-inria": {("r6", 0)}, "hac": ends | curve, "hac-plus": ends | curve, "lightgaussian": {("r3", 0)},
+        "mesongs": {("r2", 0), ("r4", 0)}, "compact3dgs-synthetic": {("r5", 0), ("r7", 0)}, "c3dgs": {("r4", 0)},
+    }  # fmt: skip
+    assert all("background=black" in cell.sets for cell in chair if cell.method.startswith("hac"))
+    assert {cell.scene.partition("/")[0] for cell in cells} == {"nerf_synthetic", "mipnerf360", "tandt", "db"}
+
+
+def test_the_plan_of_the_cells_is_legal_and_leads_to_the_same_folders(script, tmp_path):
+    demo = script.Cell("3dgs-inria", "3dgs", "demo:tiny", "r6", preset="inria", sets=("iterations=5",))
+    cells = [replace(demo, seed=seed, rate=rate) for seed, rate in ((0, "r6"), (0, "r2"), (2, "r6"))]
+    cells += [script.Cell("hac", "hac", "demo", "r1", 1, sets=("growth.init_factor=4", "background=black"))]
+    file = tmp_path / "plan.toml"
+    file.write_text(sys.modules["sweep_cells"].plan_text(cells))
+    planned = cells_of(read_plan(file)[0], Layout(tmp_path / "out"), load_plugins())
+    assert {cell.directory for cell in planned} == {cell.directory(tmp_path / "out") for cell in cells}
+    (hac,) = [cell.resolved for cell in planned if cell.label == "hac"]
+    assert (hac.config.growth.init_factor, hac.scene.background, hac.preset) == (4, "black", "paper")
+
+
+def test_one_label_stands_for_one_configuration(script):
+    cell = script.Cell("hac", "hac", "demo:tiny", "r1")
+    with pytest.raises(ValueError, match="several configurations"):
+        sys.modules["sweep_cells"].plan_text([cell, replace(cell, rate="r2", sets=("voxel_size=1",))])
+
+
+def test_cells_are_run_once_and_stand_beside_what_was_published(script, bench, data, tmp_path, capsys):
+    out = tmp_path / "out"
+    arguments = (out, "--only", "hac", "--only", "mic", "--gpus", "0,1", "--jobs", 10)
+    status, fake = bench(script, *arguments, "--set", "iterations=5")
+    told = capsys.readouterr().out
+    assert status == 0
+    assert fake.commands[0][:2] == ["bench", str(out / "cells.toml")]
+    assert "workers=10" in fake.commands[0]
+    assert fake.environments[0]["CUDA_VISIBLE_DEVICES"] == "0,1"
+    assert '"iterations" = "5"' in (out / "cells.toml").read_text()
+    assert len(fake.made) == 18
+    assert "18 ran" in told
+    assert "mic: nowhere" not in told
+    assert "scene 'nerf_synthetic/mic' is not there" in told
+    assert "34.05 ± 0.05" in told  # r1 of three seeds
+    assert "overlap hac nerf_synthetic/chair: 38 %, published 34.73 to 35.49, here 34.05 to 36.05 dB" in told
+    assert "background white here, black there" in told
+    status, fake = bench(script, *arguments)
+    told = capsys.readouterr().out
+    assert (status, fake.made) == (0, [])
+    assert "18 was there" in told
+    assert "34.05 ± 0.05" in told
+
+
+def test_bytes_at_equal_psnr_come_from_all_rate_points(script, bench, data, tmp_path, capsys):
+    facts = tmp_path / "rows.json"
+    bench(script, tmp_path / "out", "--only", "hac", "--json", facts)
+    rows = {(row["label"], row["published"]["rate"]): row for row in json.loads(facts.read_text())}
+    low = rows["hac", "r1"]
+    assert [point["rate"] for point in low["curve"]] == ["r1", "r2", "r3", "r4", "r5"]
+    # The published 34.726 dB lie between r2 (34.5 dB, one seed) and r3 (35.0).
+    expected = 400_000 * 2 ** (2 + (34.726 - 34.5) / 0.5)
+    assert low["at_equal"]["bytes"] == pytest.approx(expected)
+    assert low["at_equal"]["ratio"] == pytest.approx(expected / 1_080_662)
+    assert low["measured"]["psnr"] == pytest.approx([34.0, 34.05, 34.1])
+    assert rows["hac-plus", "r1"]["at_equal"]["why"] == "0.15 dB below what is measured here"
+    bench(script, tmp_path / "out", "--only", "hac", "--table", "--markdown")
+    assert " hac r1 chair | 34.05 ± 0.05 | 34.73 | -0.68 |" in capsys.readouterr().out
+
+
+def test_a_failure_is_told_with_its_reason(script, bench, data, tmp_path, capsys):
+    status, _ = bench(script, tmp_path / "out", "--only", "lightgaussian", fails=("lightgaussian",))
+    told = capsys.readouterr().out
+    assert status == 1
+    assert "failed: lightgaussian r3 nerf_synthetic/chair seed 0 CUDA out of memory" in told
+    assert "1 failed" in told
+
+
+def test_a_plan_lists_cells_and_runs_nothing(script, bench, data, tmp_path, capsys):
+    status, fake = bench(script, tmp_path / "out", "--only", "mesongs r4", "--plan")
+    told = capsys.readouterr().out
+    assert (status, fake.commands) == (0, [])
+    assert "1 to run" in told
+    assert "measured beside published" not in told
+
+
+@pytest.mark.parametrize(
+    ("text", "hac", "other"), [("", 3, 1), ("1", 1, 1), ("hac=5", 5, 1), ("2,hac=5", 5, 2), ("hac=5,2", 5, 2)]
+)
+def test_seeds_are_a_number_for_all_or_for_a_method(script, text, hac, other):
+    found = script.seeds_of(text)
+    assert found.get("hac", found.get("", 1)) == hac
+    assert found.get("3dgs", found.get("", 1)) == other
+    with pytest.raises(ValueError):
+        script.seeds_of("hac=0")
 
 
 @pytest.fixture
@@ -93,70 +235,135 @@ def other_run(tmp_path: Path):
     return kept
 
 
-def test_finished_runs_stand_for_a_row_with_their_mean_and_what_differs(start, other_run, tmp_path, monkeypatch):
-    monkeypatch.delenv("SPLATWIZARD_DATA", raising=False)
+@pytest.fixture
+def lego(script):
+    """The row of hac r1 on lego."""
+    rows = script.rows_of(script.read_published())
+    return next(r for r in rows if (r.label, r.figure.scene, r.figure.rate) == ("hac", "lego", "r1"))
+
+
+def test_finished_runs_stand_for_a_row_with_their_mean_and_what_differs(
+    script, bench, other_run, tmp_path, data, capsys
+):
     other_run(0, metrics={"psnr": {"mean": 33.0}})
     other_run(1, metrics={"psnr": {"mean": 34.0}}, file={"bytes": 1236})
     other_run(2, preset="mcmc")
     other_run(3, rate="r2")
     other_run(4, dataset="colmap")  # another scene of that name
-    given, told = start("--table", "--runs", str(tmp_path / "h200"), "--only", "lego", dataset="nerf_synthetic")
-    assert given == []
-    assert "33.50 / 35.04" in told
-    assert "1,235 / 1,313,656" in told
+    shutil.copytree(data / "nerf_synthetic" / "chair", data / "nerf_synthetic" / "lego")
+    arguments = ("--runs", tmp_path / "h200", "--only", "hac r1 nerf_synthetic/lego")
+    _, fake = bench(script, tmp_path / "out", *arguments)
+    told = capsys.readouterr().out
+    assert fake.commands == []
+    assert "33.50 ± 0.71" in told
+    assert "1,235 ± 1" in told
     assert "background white here, black there" in told
     assert "2 test views here, 200 there" in told
-    assert "preset" not in told.replace("preset paper", "")
+    assert not any("differs: preset" in line for line in told.splitlines())
 
 
-def test_a_record_that_cannot_be_read_is_told_once_and_left_out(script, other_run, tmp_path, capsys):
-    row = next(r for r in script.read_rows(script.ROWS) if (r.figure.method, r.scene, r.rate) == ("hac", "lego", "r1"))
-    own = row.run(tmp_path / "out")
+def test_a_record_that_cannot_be_read_is_told_once_and_left_out(script, lego, other_run, tmp_path, capsys):
+    own = lego.cell(0).directory(tmp_path / "out")
     own.mkdir(parents=True)
     (own / "metrics.json").write_text("{")
     other_run(0, metrics={"psnr": {"mean": 33.0}})
     other_run(1, metrics=3)
     others = script.finished([tmp_path / "h200"])
-    assert [run.mean("psnr") for run in script.measured(row, tmp_path / "out", others)] == [33.0]
-    script.print_table([row], tmp_path / "out", others, script.Console(width=160))
+    found = script.measured(lego, tmp_path / "out", others)
+    assert [run.mean("psnr") for run in found.runs] == [33.0]
+    script.print_table([found], script.Console(width=220))
     told, wrong = capsys.readouterr()
-    assert "33.00 / 35.04" in told
+    assert "33.00" in told
     assert [line.split(": ")[1] for line in wrong.splitlines()] == [
         str(tmp_path / "h200" / "seed-1" / "lego" / "hac" / "r1" / "metrics.json"), str(own / "metrics.json"),
     ]  # fmt: skip
 
 
-def test_runs_of_the_preset_that_is_meant_come_before_those_of_paper(script, other_run, tmp_path):
-    row = next(r for r in script.read_rows(script.ROWS) if (r.figure.method, r.scene, r.rate) == ("hac", "lego", "r1"))
-    row = replace(row, preset="inria")
+def test_runs_of_the_preset_that_is_meant_come_before_those_of_paper(script, lego, other_run, tmp_path):
+    row = replace(lego, figure=lego.figure.model_copy(update={"preset": "inria"}))
     other_run(0)
-    found = script.measured(row, tmp_path, script.finished([tmp_path / "h200"]))
+    found = script.others_for(row, "r1", script.finished([tmp_path / "h200"]))
     assert [run.preset for run in found] == ["paper"]
     other_run(1, preset="inria")
-    found = script.measured(row, tmp_path, script.finished([tmp_path / "h200"]))
+    found = script.others_for(row, "r1", script.finished([tmp_path / "h200"]))
     assert [run.preset for run in found] == ["inria"]
 
 
-def test_a_folder_of_runs_that_is_not_there_is_named(start, tmp_path, capsys):
+def test_runs_of_another_label_are_not_those_of_a_row(script, lego, tmp_path):
+    plain, other = lego.cell(1), replace(lego.cell(1), label="hac-10000-points")
+    for cell in (plain, other):
+        folder = cell.directory(tmp_path)
+        folder.mkdir(parents=True)
+        (folder / "metrics.json").write_text(json.dumps({**RECORD, "file": {"bytes": len(cell.label)}}))
+    assert [run.file.bytes for run in script.own_runs(lego, "r1", tmp_path)] == [len("hac")]
+
+
+def test_a_folder_of_runs_that_is_not_there_is_named(script, bench, tmp_path, capsys):
     with pytest.raises(SystemExit):
-        start("--runs", str(tmp_path / "nowhere"))
+        bench(script, tmp_path / "out", "--runs", tmp_path / "nowhere")
     assert f"--runs: no folder {tmp_path / 'nowhere'}" in capsys.readouterr().err
 
 
-def test_without_data_nothing_runs_but_what_needs_none(start, monkeypatch):
+def test_without_data_nothing_runs(script, bench, tmp_path, monkeypatch, capsys):
     monkeypatch.delenv("SPLATWIZARD_DATA", raising=False)
-    _, told = start()
-    assert "nowhere/absent: SPLATWIZARD_DATA is not set" in told
-    given, told = start("--table", "--only", "absent")
-    assert given == []
-    assert "is not" not in told.replace("not re-read", "").replace("not measured yet", "")
+    status, fake = bench(script, tmp_path / "out", "--only", "chair")
+    told = capsys.readouterr().out
+    assert (status, fake.commands) == (0, [])
+    assert "$SPLATWIZARD_DATA is not set" in told
+    assert "24 missing" in told
 
 
-def test_the_rows_can_be_run_and_say_where_they_come_from(script):
-    rows, plugins = script.read_rows(script.ROWS), load_plugins()
-    assert len({(r.name, r.preset) for r in rows}) == len(rows) >= 50
-    for row in rows:
-        of = row.figure
-        resolve(plugins.methods.load(of.method), row.preset, row.rate, sets=parse_set(of.sets), scene="demo:tiny")
-        assert of.psnr is not None
-    assert any(not row.figure.verified for row in rows)
+def test_the_deadline_asks_for_checkpoints(script, monkeypatch, tmp_path):
+    cells, asked = sys.modules["sweep_cells"], []
+
+    class Slow:
+        def __init__(self, command, env):
+            self.waited = 0
+
+        def wait(self, timeout=None):
+            self.waited += 1
+            if self.waited == 1:
+                raise cells.subprocess.TimeoutExpired("sw", timeout)
+            return cells.INTERRUPTED
+
+        def send_signal(self, number):
+            asked.append(number)
+
+    monkeypatch.setattr(cells.subprocess, "Popen", Slow)
+    cell = script.Cell("3dgs", "3dgs", "demo:tiny", "r6")
+    found = cells.run_cells([cell], tmp_path, Namespace(**{**NOTHING, "deadline": 0.1}))
+    assert asked == [cells.signal.SIGTERM]
+    assert found[cell] == cells.Outcome("unfinished", "interrupted, the same command goes on")
+
+
+def test_the_matrix_has_ends_seeds_starts_curves_and_lego(starts, data, bench, tmp_path, capsys):
+    lego = tmp_path / "lego"
+    lego.mkdir()
+    arguments = (tmp_path / "out", "--lego", f"nerf_synthetic:{lego}")
+    status, fake = bench(starts, *arguments)
+    told = capsys.readouterr().out
+    assert status == 0
+    assert "57 cells: 57 ran" in told
+    names = {str(folder.relative_to(tmp_path / "out")) for folder in fake.made}
+    assert "seed-2/chair/cat-3dgs/r6" in names
+    assert "seed-0-hac-10000-points/chair/hac/r1" in names
+    assert "seed-4/lego/hac-plus/r5" in names
+    assert "seed-0/chair/hac-plus/r3" in names
+    assert "APART" not in told  # spread and differences are 0.2 dB at most
+    assert "34.05" in told
+    assert "34.00 (-0.05)" in told
+
+
+def test_the_matrix_shares_its_runs_with_the_table_of_what_is_published(starts, script, data, bench, tmp_path, capsys):
+    _, fake = bench(starts, tmp_path / "out", "--methods", "hac")
+    assert len(fake.made) == 13
+    capsys.readouterr()
+    _, fake = bench(script, tmp_path / "out", "--only", "hac ", "--table")
+    told = capsys.readouterr().out
+    assert " hac r1 chair" in told
+    assert "34.05 ± 0.05" in told
+
+
+def test_a_spread_above_the_bar_is_marked(starts, data, bench, tmp_path, capsys):
+    bench(starts, tmp_path / "out", "--methods", "hac", "--bar", "0.05")
+    assert "APART" in capsys.readouterr().out

@@ -1,6 +1,6 @@
 """Small records beside the published figures of the scene that they were cut down from: `table published SCENE`.
 
-Figures are those of sw-report (published.json), of the same method and rate point. Runs of the preset that a figure is
+Figures are those of the method's package (published.toml), of the same rate point. Runs of the preset that a figure is
 to be measured by come first, then those of `paper`, and the table says which.
 """
 
@@ -11,7 +11,8 @@ from pathlib import Path
 
 from result_groups import BASE, NONE, TITLES, Rows, points, spread
 from result_records import FROM, RECORDS, SmallRecord, read
-from sw_report.published import Figure, read_published, standing_for
+from sw_report.published import standing_for
+from sw_report.published_files import Figure, read_published
 
 FULL_SCENES = {"lego": "nerf_synthetic"}  # scene of the records -> data set whose scene of that name it is made from
 HEAD = (
@@ -61,7 +62,7 @@ def _differences(figure: Figure, group: Rows, records: Rows) -> list[str]:
         found.append("background not stated there")
     elif here not in (published if isinstance(published, list) else [published]):
         found.append(f"background {here} here, {published} there")
-    if first.preset != figure.preset:
+    if figure.preset not in (None, first.preset):
         found.append(f"preset {first.preset} here, {figure.preset} there")
     steps = _all_steps(first, records)
     if None not in (steps, figure.steps) and steps != figure.steps:

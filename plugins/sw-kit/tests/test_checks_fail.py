@@ -11,6 +11,7 @@ from sw_kit.checks import rate_points, registration
 from sw_kit.checks.behaviour import BEHAVIOUR
 from sw_kit.checks.fields import check_entry
 from sw_kit.checks.methods import check_configuration
+from sw_kit.checks.published import check_published
 from sw_kit.checks.rate_points import check_rate_points
 from sw_kit.checks.small_run import _check_encoding, _lengths
 from sw_kit.checks.targets import check_target
@@ -406,3 +407,47 @@ def test_a_finding_tells_reason_and_cure_and_never_raises():
     assert raising(NotCheckedError("no GPU", "find one")).state == "missing"
     assert raising(SystemExit(3)).detail == "SystemExit: 3"
     assert PackageCheck("sw-bad", "name", lambda: "fine").finding().state == "ok"
+
+
+FIGURES = """
+[[tables]]
+dataset = "mipnerf360"
+protocol = "survey"
+source = "a paper"
+year = 2024
+verified = false
+figures = [{}]
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (FIGURES.format('{ scene = "room", psnr = 30.0, rate = "r9" }'), "rate 'r9' is none of r1"),
+        (FIGURES.format('{ scene = "room", psnr = 30.0, preset = "none" }'), "cannot be run with preset 'none'"),
+        (FIGURES.format('{ psnr = 30.0, preset = "paper" }'), "cannot be run with preset 'paper'"),
+        (FIGURES.format('{ scene = "room" }'), "neither psnr nor bytes"),
+        (FIGURES.format('{ scene = "room", psnr = "high" }'), "table 1, figure 1: psnr"),
+        ("", "holds no figure"),
+    ],
+)
+def test_published_figures_that_are_wrong(text, said, tmp_path, monkeypatch):
+    package = tmp_path / "sw_bad_figures"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "published.toml").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "sw_bad_figures", raising=False)
+    ours = PLUGINS.methods.entry("3dgs")
+    entry = Entry("method", "3dgs", ours.target, "one line", {"published": "sw_bad_figures:published.toml"}, "sw-bad")
+    with pytest.raises(BrokenContractError, match=said):
+        check_published(entry, PLUGINS)
+
+
+def test_published_figures_that_are_right_are_counted(tmp_path, monkeypatch):
+    assert check_published(PLUGINS.methods.entry("3dgs"), PLUGINS).endswith("of them second-hand")
+
+
+def test_the_place_of_published_figures_is_a_file_of_a_package(entry_of):
+    with pytest.raises(BrokenContractError, match="published"):
+        check_entry(entry_of("method", Method, published="published.toml"))

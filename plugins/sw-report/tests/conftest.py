@@ -3,7 +3,7 @@
 import json
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from types import ModuleType
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from sw_report.published_files import read_published
 
 from splatwizard_core.plugins import PluginManager, hookimpl
 from splatwizard_core.runs.record import Record
@@ -52,7 +53,8 @@ def register_datasets(registry: Any) -> None:
 @hookimpl
 def register_methods(registry: Any) -> None:
     for name, rank in (("hac", 1), ("lightgaussian", 2), ("3dgs", 3)):
-        registry.add(name, "nowhere:method", summary="", bd_anchor=rank)
+        declared = {"published": "published_example:hac.toml"} if name == "hac" else {}
+        registry.add(name, "nowhere:method", summary="", bd_anchor=rank, **declared)
     registry.add("another", "nowhere:method", summary="")
 
 
@@ -63,7 +65,7 @@ def register_coders(registry: Any) -> None:
 
 
 @pytest.fixture(autouse=True)
-def installed(monkeypatch: pytest.MonkeyPatch) -> PluginManager:
+def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[PluginManager]:
     """The core, and beside it what the hooks above declare, whatever is installed where the tests run."""
     plugin = ModuleType("declaring_plugin")
     for hook in (register_metrics, register_datasets, register_methods, register_coders):
@@ -74,8 +76,12 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> PluginManager:
          EntryPoint("declaring", plugin.__name__, "splatwizard")]
     )  # fmt: skip
     assert not found.broken
+    monkeypatch.syspath_prepend(str(Path(__file__).parent))
     monkeypatch.setattr("sw_report.declared.load_plugins", lambda: found)
-    return found
+    monkeypatch.setattr("sw_report.published_files.load_plugins", lambda: found)
+    read_published.cache_clear()
+    yield found
+    read_published.cache_clear()
 
 
 def photograph(view: int, size: tuple[int, int] = SIZE) -> np.ndarray:

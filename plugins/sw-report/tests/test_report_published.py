@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
 from sw_report.beside_tables import beside_tables, deltas
 from sw_report.compare import compare
-from sw_report.published import FILE, beside, differences, read_published, steps_of
+from sw_report.equal_psnr import CurvePoint, at_equal, overlap
+from sw_report.published import beside, differences, steps_of
+from sw_report.published_files import Figure, published_by, read_figures, read_published
 from sw_report.runs import collect
 
 from splatwizard_core.api import UserInputError
@@ -37,24 +40,6 @@ def written(folder: Path, scenes=("bonsai",), **changes) -> list:
 @pytest.fixture
 def runs(tmp_path):
     return lambda **changes: written(tmp_path / "out", **changes)
-
-
-def test_every_figure_says_where_it_comes_from():
-    figures = read_published()
-    assert len(figures) > 100
-    for figure in figures:
-        assert figure.source
-        assert 2020 < figure.year < 2030
-        assert figure.protocol.text
-        assert figure.psnr is not None or figure.bytes is not None
-        assert figure.psnr is None or 15 < figure.psnr < 45
-        assert figure.bytes is None or 10**5 < figure.bytes < 10**9, "bytes, not megabytes"
-    named = [(f.method, f.variant, f.dataset, f.scene, f.psnr) for f in figures]
-    assert len(set(named)) == len(named)
-    # Figures that others are made of: the mean of 3DGS's nine scenes is its published mean.
-    scenes = [f.psnr for f in figures if (f.method, f.dataset) == ("3dgs", "mipnerf360") and f.scene is not None]
-    assert len(scenes) == 9
-    assert sum(scenes) / 9 == pytest.approx(27.21, abs=0.006)
 
 
 def test_a_run_as_published_differs_in_what_nobody_can_change_alone(runs):
@@ -87,7 +72,7 @@ def test_steps_count_those_of_the_scene_that_a_training_started_from(runs):
     (run,) = runs(train={**STEPS, "steps": 5000, "pretraining": {"3dgs": {"steps": 30_000}}})
     assert steps_of(run.facts) == 35_000
     (run,) = collect([run.directory]).runs
-    figure = next(f for f in read_published() if f.method == "c3dgs" and f.dataset == "mipnerf360")
+    (figure,) = read_figures(TABLE.format(more='protocol = "360-unstated"\nsteps = 35000'), "theirs", "c3dgs")
     assert not any("steps" in line for line in differences(run.facts, figure))
     assert "pictures not stated there" in differences(run.facts, figure)
 
@@ -117,7 +102,9 @@ def test_means_are_compared_once_every_scene_is_there(runs, tmp_path):
     assert mean.title == "mean over Mip-NeRF 360, 9 scenes"
     ((_, (found,)),) = mean.groups
     assert found.figure.bytes == 16_005_406
-    assert {"cat-3dgs", "mesongs"} <= {figure.method for figure in mean.others}
+    assert {"hemgs", "contextgs"} <= {figure.method for figure in mean.others}
+    assert {figure.method for figure in mean.left_out} == {"bogauss"}
+    assert "left out, since its protocol is not that of the others: bogauss, tiny" in "\n".join(mean.drawn().notes)
 
 
 def test_the_command_prints_both_and_names_scenes_without_figures(runs, tmp_path):
@@ -127,7 +114,7 @@ def test_the_command_prints_both_and_names_scenes_without_figures(runs, tmp_path
     assert "hac r1" in done.output
     assert "32.27" in done.output or "32.28" in done.output
     assert "results/MipNeRF360/bonsai.csv" in done.output
-    assert "mesongs" in done.output
+    assert "contextgs" in done.output
     done = CliRunner().invoke(compare, [str(tmp_path / "out"), "--published", "--own", "--json"])
     content = json.loads(done.output)
     assert content["tables"][0]["others"] == []
@@ -136,9 +123,139 @@ def test_the_command_prints_both_and_names_scenes_without_figures(runs, tmp_path
         beside_tables(written(tmp_path / "demo", ("demo",), dataset="demo"))
 
 
-def test_a_file_with_a_wrong_field_is_named(tmp_path):
-    content = json.loads(FILE.read_text("utf-8"))
-    wrong = tmp_path / "wrong.json"
-    wrong.write_text(json.dumps({**content, "figures": [content["figures"][0], {**content["figures"][0], "psnrr": 3}]}))
-    with pytest.raises(UserInputError, match=r"figure 2: psnrr"):
-        read_published(wrong)
+def test_bytes_at_equal_psnr_are_those_of_the_rate_points_around(tmp_path):
+    sizes = {"r1": (31.275, 4_937_215), "r5": (33.275, 19_748_859)}  # 1.1 of half and of twice the published bytes
+    for rate, (psnr, size) in sizes.items():
+        written(tmp_path / "out", rate=rate, file={"bytes": size}, metrics={"psnr": {"mean": psnr}})
+    (table,) = beside_tables(collect([tmp_path / "out"]).runs, others=False)
+    low = table.groups[0][0]
+    found = at_equal(low.curve, 32.275, 8_976_754)
+    assert found.ratio == pytest.approx(1.1)  # half way in dB, and in the logarithm of bytes
+    assert found.gain == pytest.approx(-math.log(1.1, 4) * 2, abs=1e-6)
+    (line, *_) = [line for line in table.drawn().rows if "[1]" in line.cells[0].text]
+    assert [cell.text for cell in line.cells[-2:]] == ["−45.0 %", "+10.0 %"]
+
+
+def test_one_rate_point_makes_no_curve_and_that_is_said(runs):
+    (run,) = runs()
+    (table,) = beside_tables([run], others=False)
+    assert any("no bytes at equal PSNR: 1 rate point measured here" in note for note in table.drawn().notes)
+
+
+CURVE = [CurvePoint("r1", 1e6, 30.0), CurvePoint("r2", 2e6, 32.0), CurvePoint("r3", 4e6, 33.0)]
+
+
+@pytest.mark.parametrize(
+    ("psnr", "size", "ratio", "gain", "why"),
+    [
+        (31.0, 2e6, 2**-0.5, 1.0, ""),
+        (32.5, 2e6, 2**0.5, -0.5, ""),
+        (33.4, 4e6, None, -0.4, "0.40 dB above what is measured here"),
+        (29.9, 8e6, None, None, "0.10 dB below what is measured here"),
+        (None, 2e6, None, None, "no PSNR is published"),
+        (31.0, None, None, None, ""),
+    ],
+)
+def test_a_published_point_against_a_curve(psnr, size, ratio, gain, why):
+    found = at_equal(CURVE, psnr, size)
+    assert found.ratio == (None if ratio is None else pytest.approx(ratio))
+    assert found.gain == (None if gain is None else pytest.approx(gain))
+    assert found.why == why
+
+
+def test_a_point_that_a_smaller_file_beats_bends_no_curve():
+    worse = CurvePoint("r4", 5e6, 31.0)
+    assert at_equal([*CURVE, worse], 32.5, 2e6) == at_equal(CURVE, 32.5, 2e6)
+
+
+def test_the_overlap_is_a_share_of_the_wider_range():
+    assert overlap(CURVE, [31.0, 35.0]) == pytest.approx(2 / 4)
+    assert overlap(CURVE, [34.0, 35.0]) == 0.0
+    assert overlap(CURVE, [34.0]) is None
+
+
+TABLE = """
+[[tables]]
+dataset = "mipnerf360"
+source = "a paper, {{scene}}.csv"
+year = 2024
+verified = true
+{more}
+figures = [{{ scene = "room", rate = "r1", psnr = 30.0 }}]
+"""
+
+
+def test_a_file_of_figures_is_read_with_its_own_protocols():
+    more = 'protocol = "mine"'
+    own = '\n[protocols.mine]\ntext = "as we like it"\nrules = { background = "grey" }\n'
+    (figure,) = read_figures(TABLE.format(more=more) + own, "theirs", "theirs")
+    assert figure.protocol.rules == {"background": "grey"}
+    assert (figure.method, figure.source, figure.rate, figure.bytes) == ("theirs", "a paper, room.csv", "r1", None)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (TABLE.format(more='protocol = "none"'), r"theirs: table 1, figure 1: no protocol is called 'none'"),
+        (TABLE.format(more='protocol = "survey"\npsnrr = 3'), r"table 1, figure 1: psnrr: Extra"),
+        (TABLE.format(more='protocol = "survey"\nmethod = "hac"'), r"leave out 'method': the file is of 'mine'"),
+        (TABLE.format(more='protocol = "survey"').replace("30.0", "-1"), r"figure 1: psnr: Input should be greater"),
+        (
+            TABLE.format(more='protocol = "survey"').replace("verified = true", ""),
+            r"figure 1: verified: Field required",
+        ),
+        ("tables = 3", r"theirs: tables must be a list of tables"),
+        ("figures = []", r"theirs: unknown key 'figures'"),
+        ("[[tables", r"theirs is not valid TOML"),
+        ("[protocols.x]\nrules = 3", r"theirs: protocol x: "),
+    ],
+)
+def test_what_is_wrong_in_a_file_of_figures_is_named(text, told):
+    with pytest.raises(UserInputError, match=told):
+        read_figures(text, "theirs", "mine")
+
+
+BROKEN = {
+    "missing": ("", None), "damaged": ("", b"[[tables"), "binary": ("", b"\xff\xfe"),
+    "exits": ("raise SystemExit('no')", b""), "raises": ("raise RuntimeError('no')", b""),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", BROKEN)
+def test_a_broken_file_is_left_out_with_one_line_that_names_its_distribution(
+    fault, installed, tmp_path, monkeypatch, caplog
+):
+    code, content = BROKEN[fault]
+    package = tmp_path / f"figures_{fault}"
+    package.mkdir()
+    (package / "__init__.py").write_text(code)
+    if content is not None:
+        (package / "published.toml").write_bytes(content)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    registry = installed.methods
+    registry._owner = ("sw-theirs", "0.2", True)
+    registry.add("theirs", "nowhere:method", summary="", published=f"{package.name}:published.toml")
+    figures = read_published()
+    assert {"hac", "contextgs"} <= {figure.method for figure in figures}
+    (line,) = [record.getMessage() for record in caplog.records]
+    assert line.startswith("sw-theirs 0.2: published figures of 'theirs' are left out: ")
+    assert "\n" not in line
+
+
+@pytest.mark.parametrize("value", ["published.toml", "a:b.json", "a:../b.toml", 3, ["a:b.toml"]])
+def test_an_entry_that_declares_figures_in_another_way_is_refused(value, installed):
+    installed.methods.add("theirs", "nowhere:method", summary="", published=value)
+    assert "theirs" not in installed.methods
+    assert "it must be 'package:file.toml'" in installed.methods.refused[-1][1]
+
+
+def test_a_method_that_is_installed_brings_its_figures_itself(installed, tmp_path, monkeypatch):
+    package = tmp_path / "figures_of_contextgs"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "published.toml").write_text(TABLE.format(more='protocol = "survey"'))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    installed.methods.add("contextgs", "nowhere:method", summary="", published=f"{package.name}:published.toml")
+    (figure,) = published_by(installed.methods.entry("contextgs"))
+    assert isinstance(figure, Figure)
+    assert [each for each in read_published() if each.method == "contextgs"] == [figure]

@@ -8,4 +8,5 @@ def register_methods(registry: Registry) -> None:
     registry.add("2dgs", "sw_2dgs.method:TwoDGS",
                  summary="2D Gaussian Splatting (Huang et al. 2024): surfels, for surfaces and meshes",
                  presets=["paper", "quick"],
-                 rates=["r1", "r2", "r3", "r4", "r5", "r6"], bd_anchor=3)  # fmt: skip
+                 rates=["r1", "r2", "r3", "r4", "r5", "r6"], bd_anchor=3,
+                 published="sw_2dgs:published.toml")  # fmt: skip

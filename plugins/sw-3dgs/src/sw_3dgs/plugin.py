@@ -8,4 +8,5 @@ def register_methods(registry: Registry) -> None:
     registry.add("3dgs", "sw_3dgs.method:ThreeDGS",
                  summary="3D Gaussian Splatting (Kerbl et al. 2023), float32 or quantised",
                  default=True, presets=["paper", "inria", "inria2024", "absgrad", "mcmc", "fast", "fast-cpu", "quick"],
-                 rates=["r1", "r2", "r3", "r4", "r5", "r6"], bd_anchor=3)  # fmt: skip
+                 rates=["r1", "r2", "r3", "r4", "r5", "r6"], bd_anchor=3,
+                 published="sw_3dgs:published.toml")  # fmt: skip

@@ -9,4 +9,5 @@ def register_methods(registry: Registry) -> None:
                  summary="anchors under a triplane context, autoregressive over channels (Zhan et al. 2025)",
                  presets=["paper", "tandt", "db", "bungee", "quick"],
                  rates=["r1", "r2", "r3", "r4", "r5", "r6"],
-                 native="sw_anchors.native:ANCHORS")  # fmt: skip
+                 native="sw_anchors.native:ANCHORS",
+                 published="sw_cat_3dgs:published.toml")  # fmt: skip

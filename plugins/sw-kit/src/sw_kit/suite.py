@@ -76,6 +76,11 @@ def _of_entry(entry: Entry, plugins: PluginManager, quick: bool, settings: Seque
 
         return check_configuration(entry, plugins)
 
+    def figures() -> str:
+        from sw_kit.checks.published import check_published
+
+        return check_published(entry, plugins)
+
     def behaviour() -> str:
         from sw_kit.checks.behaviour import BEHAVIOUR
 
@@ -95,6 +100,8 @@ def _of_entry(entry: Entry, plugins: PluginManager, quick: bool, settings: Seque
     found = [PackageCheck(entry.distribution, f"{whose} has the contract's form", signatures)]
     if is_method:
         found.append(PackageCheck(entry.distribution, f"{whose} has presets and rate points", configuration))
+    if is_method and "published" in entry.declared:
+        found.append(PackageCheck(entry.distribution, f"{whose} has published figures", figures))
     if not quick and entry.kind in BEHAVES:
         found.append(PackageCheck(entry.distribution, f"{whose} keeps the contract", behaviour))
     if not quick and is_method:

@@ -8,7 +8,8 @@ def register_methods(registry: Registry) -> None:
     registry.add("mesongs", "sw_mesongs.method:MesonGS",
                  summary="MesonGS (Xie et al. 2024): prune, octree, RAHT, codebook, fine-tune what is decoded",
                  presets=["paper", "nerf_synthetic", "mipnerf360", "tandt", "db", "quick"],
-                 rates=["r1", "r2", "r3", "r4"])  # fmt: skip
+                 rates=["r1", "r2", "r3", "r4"],
+                 published="sw_mesongs:published.toml")  # fmt: skip
 
 
 @hookimpl

@@ -8,7 +8,8 @@ def register_methods(registry: Registry) -> None:
     registry.add("pup-3dgs", "sw_pup_3dgs.method:Pup3DGS",
                  summary="removes 90 % of a trained 3DGS scene by its Fisher information (Hanson et al. 2025)",
                  presets=["paper", "splatwizard", "quick"],
-                 rates=["r1", "r2", "r3", "r4", "r5", "r6"])  # fmt: skip
+                 rates=["r1", "r2", "r3", "r4", "r5", "r6"],
+                 published="sw_pup_3dgs:published.toml")  # fmt: skip
 
 
 @hookimpl

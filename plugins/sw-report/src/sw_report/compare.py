@@ -54,8 +54,9 @@ def compare(
     on a scene (--scene, or that of a run directory) also of both against the test pictures.
 
     With --published every run under RUN... is put beside published figures, scene by scene, and means over whole data
-    sets. Each figure is told with its source and year, and with what differs between its protocol and the run's.
-    Figures that were not re-read at their source are marked.
+    sets. Each figure is told with its source and year, and with what differs between its protocol and the run's. At
+    equal PSNR stands the size of the rate points that were run, where they reach it. Figures that were not re-read at
+    their source are marked.
     """
     if published:
         _beside_published(paths, own, as_json)

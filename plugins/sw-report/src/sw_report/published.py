@@ -1,22 +1,17 @@
-"""Published figures, each with its source, its protocol and its year, as `published.json` beside this file has them."""
+"""Published figures beside a measurement: which are meant, and in what their protocols differ."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
-from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
-
-from splatwizard_core.api import UserInputError
 from sw_report.commands import value_of
 from sw_report.facts import RunFacts
 from sw_report.numbers import FIELD_LPIPS, count
+from sw_report.published_files import Figure
 
-FILE = Path(__file__).with_name("published.json")
 METRICS: Mapping[str, str] = {"psnr": "psnr", "ssim": "ssim", "lpips": FIELD_LPIPS}
 """Figure -> the metric of ours that computes it as the published one."""
 OTHERWISE = "paper"
@@ -29,81 +24,6 @@ class HasPreset(Protocol):
 
 
 Run = TypeVar("Run", bound=HasPreset)
-
-
-class Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class PublishedProtocol(Strict):
-    """Conditions of a published figure.
-
-    text        in words
-    rules       rule of a record's protocol -> the published value, or those that it may have
-    unstated    what the source does not say
-    size        width and height of the pictures, pixels
-    """
-
-    text: str
-    rules: dict[str, str | int | list[str]] = {}
-    unstated: list[str] = []
-    size: tuple[int, int] | None = None
-    test_views: int | None = None
-
-
-class Figure(Strict):
-    """One published row.
-
-    variant     name of the rate at its source; rate: the rate point of ours that is meant, None: there is none
-    scene       None: the mean over the data set
-    psnr, ..., gaussians    as published, PSNR in dB, primitives as submitted; None: not published
-    steps       of the whole training, all stages; None: not known
-    differs     what differs from a measurement of ours whatever is done
-    verified    False: second-hand, or recalled and not re-read
-    preset, sets, images    how a run here comes closest; without a preset it is not run
-    """
-
-    method: str
-    variant: str
-    rate: str | None
-    dataset: str
-    scene: str | None
-    psnr: float | None
-    ssim: float | None
-    lpips: float | None
-    bytes: int | None
-    gaussians: int | None
-    steps: int | None
-    protocol: PublishedProtocol
-    differs: list[str]
-    source: str
-    year: int
-    verified: bool
-    preset: str | None = None
-    sets: list[str] = []
-    images: str = ""
-
-    @property
-    def label(self) -> str:
-        """Method, and the name of the rate at its source."""
-        return f"{self.method}, {self.variant}" if self.variant else self.method
-
-
-@cache
-def read_published(path: Path = FILE) -> tuple[Figure, ...]:
-    """Read a file of figures. Raises UserInputError that names the first one whose fields are wrong."""
-    content = json.loads(path.read_text("utf-8"))
-    found = []
-    for number, values in enumerate(content["figures"], 1):
-        try:
-            found.append(Figure(**{**values, "protocol": content["protocols"][values["protocol"]]}))
-        except KeyError as error:
-            raise UserInputError(f"{path}, figure {number}: no {error}") from None
-        except ValidationError as error:
-            first = error.errors()[0]
-            where = ".".join(map(str, first["loc"]))
-            raise UserInputError(f"{path}, figure {number}: {where}: {first['msg']}") from None
-    return tuple(found)
 
 
 @dataclass(frozen=True)

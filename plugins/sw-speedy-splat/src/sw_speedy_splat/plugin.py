@@ -8,7 +8,8 @@ def register_methods(registry: Registry) -> None:
     registry.add("speedy-splat", "sw_speedy_splat.method:SpeedySplat",
                  summary="3DGS pruned hard while and after it densifies (Hanson et al. 2025)",
                  presets=["paper", "inria", "quick"],
-                 rates=["r1", "r2", "r3", "r4", "r5", "r6"])  # fmt: skip
+                 rates=["r1", "r2", "r3", "r4", "r5", "r6"],
+                 published="sw_speedy_splat:published.toml")  # fmt: skip
 
 
 @hookimpl

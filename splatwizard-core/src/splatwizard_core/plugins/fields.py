@@ -46,4 +46,6 @@ def _wanted(field: str, value: Any) -> str | None:
         return "a list of texts"
     if field == "native" and value and not (are_texts and all(re.fullmatch(r"[\w.]+:[\w.]+", each) for each in texts)):
         return "'module:attribute', or a list of such"
+    if field == "published" and not (isinstance(value, str) and re.fullmatch(r"[\w.]+:[\w.-]+\.toml", value)):
+        return "'package:file.toml', a file in that package"
     return None

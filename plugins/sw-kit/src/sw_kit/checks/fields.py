@@ -8,6 +8,8 @@ import re
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
+from sw_report.published_files import DECLARED
+
 from splatwizard_core.tooling import MetricInfo
 from sw_kit.finding import hold
 
@@ -39,6 +41,10 @@ NAMES: Rule = (_names, "a list of names")
 SUFFIXED: Rule = (lambda value: isinstance(value, str) and value.startswith(".") and len(value) > 1, 'such as ".ply"')
 SUFFIX: Rule = (lambda value: value == "" or SUFFIXED[0](value), 'such as ".ply", or "" (by --format alone)')
 WHERE: Rule = (lambda value: isinstance(value, str) and bool(TARGET.fullmatch(value)), '"module:attribute"')
+FIGURES: Rule = (
+    lambda value: isinstance(value, str) and bool(DECLARED.fullmatch(value)),
+    '"package:file.toml", a file in that package',
+)
 MODULES: Rule = (
     lambda value: all(WHERE[0](each) for each in (value if isinstance(value, list) else [value])),
     '"module:attribute" of a NativeModule, or a list of them',
@@ -54,7 +60,7 @@ METRIC: dict[str, Rule] = {
     "diagnostic": FLAG, "slow": FLAG, "unrounded": FLAG, "over": OVER,
 }  # fmt: skip
 FIELDS: Mapping[str, Mapping[str, Rule]] = {
-    "method": {"presets": NAMES, "rates": NAMES, "bd_anchor": COUNT, "default": FLAG},
+    "method": {"presets": NAMES, "rates": NAMES, "bd_anchor": COUNT, "default": FLAG, "published": FIGURES},
     "metric": METRIC,
     "coder": {"codes": CODES, "available": WHERE, "stores": TEXT},
     "exporter": {"suffix": SUFFIX},
