@@ -125,7 +125,7 @@ def test_a_run_that_no_package_reports_ends_in_a_line(tmp_path: Path, monkeypatc
         (["info", "/nowhere/at-all"], "/nowhere/at-all"),
         (["decode", "/nowhere/scene.swz"], "there is no such file"),
         (["eval", "/nowhere/scene.swz"], "there is no such file"),
-        (["eval", "{text}"], "not a .swz file"),
+        (["eval", "{text}", "--scene", "demo:tiny"], "not a .swz file"),
         (["info", "{text}"], "{text}"),
         (["encode", "{text}"], "takes a run directory or a .ply"),
         (["export", "{text}", "x.ply"], "not a .swz file"),
@@ -145,7 +145,7 @@ def test_a_run_that_no_package_reports_ends_in_a_line(tmp_path: Path, monkeypatc
         (["decode", "{text}", "--out", "{folder}"], "{folder} is a folder: give the name of a file in it"),
         (["encode", "{text}", "--out", "{folder}/none/x.swz"], "there is no folder {folder}/none"),
         (["eval", "{text}", "--metrics", ","], "--metrics is empty"),
-        (["eval", "{text}", "--metrics", "pnsr"], "no metric is called 'pnsr'"),
+        (["eval", "{text}", "--scene", "demo:tiny", "--metrics", "pnsr"], "no metric is called 'pnsr'"),
         (["eval", "{text}", "--renders", "{text}"], "cannot write into {text}: it is a file"),
     ],
 )  # fmt: skip

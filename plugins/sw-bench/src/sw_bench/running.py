@@ -95,6 +95,9 @@ def _plan_of_words(methods: list[str], scenes: list[str], seeds: list[int], give
         said = Choices(methods=tuple(methods), config_file=file)
         default["methods"] = said.method_names(plugins)[0]
         default["scenes"] = default["scenes"] if scenes else said.resolve(plugins)[0].scene_spec
+    if not scenes:
+        started = Choices(init=given["init"], config_file=file, sets=tuple(given["sets"])).of_start()
+        default["scenes"] = started.scene or default["scenes"]
     content: dict[str, Any] = {
         "methods": methods or [name for name in [default["methods"]] if name],
         "scenes": scenes or [name for name in [default["scenes"]] if name],

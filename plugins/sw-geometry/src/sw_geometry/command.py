@@ -37,7 +37,7 @@ def _depths(_context: click.Context, _parameter: click.Parameter, incomplete: st
 @click.argument("file", metavar="FILE|RUN", type=click.Path())
 @options(
     click.option("--scene", metavar="SCENE", type=SCENE,
-                 help="Whose cameras see it.  [default: that of the run directory]"),
+                 help="Whose cameras see it.  [default: that of the run directory, or of the one that FILE lies in]"),
     click.option("--out", metavar="DIR", type=OUTPUT_FOLDER,
                  help="Folder for mesh.ply, mesh_post.ply, mesh.png, mesh.json.  [default: RUN/mesh, else mesh]"),
     click.option("--voxel-size", type=LENGTH, metavar="X",
@@ -102,7 +102,8 @@ def mesh(
     path = existing_file(run / "scene.swz" if run is not None else file)
     config = None if run is None else str(run / "config.toml")
     target = out or (run / "mesh" if run is not None else Path("mesh"))
-    chosen = Choices(scene=scene, config_file=config, sets=sets, device=device).resolve_without_method()
+    choices = Choices(scene=scene, config_file=config, sets=sets, device=device)
+    chosen = choices.of_file(path).resolve_without_method()
     settings, setup = _settings(chosen.metrics, given, no_mask)
     try:
         import_open3d()  # before the work, not after it

@@ -36,7 +36,7 @@ def _seeds(text: str) -> int | tuple[int, ...]:
 scene_option = click.option(
     "--scene", metavar="SCENE", type=SCENE,
     help="A folder (the format is detected), `dataset/scene` under $SPLATWIZARD_DATA, or a scene that is made on the "
-    "spot, by its name.  [default: such a one]",
+    "spot, by its name.  [default: such a one; of a file, that of its run directory]",
 )  # fmt: skip
 images_option = click.option(
     "--images", metavar="FOLDER",

@@ -131,6 +131,42 @@ class Choices:
                 from_file[key] = value
         return resolve(NoMethod, "paper", sets={**from_file, **values}, scene=self.scene or tables.get("scene"))
 
+    def of_file(self, path: Path, tell: Callable[[str], None] = say) -> Choices:
+        """The same for what looks at a file on a scene: where none is named, that of the file's run directory, as it
+        was read there.
+
+        Raises click.UsageError if nothing says whose file it is: on a default scene its numbers would be about nothing.
+        """
+        found = self._scene_of(path)
+        if found is None:
+            return self
+        scene, config = found
+        tell(f"scene {scene}, as in the run directory that {path} lies in (--scene names another)")
+        return replace(self, scene=scene, config_file=self.config_file or str(config))
+
+    def of_start(self, tell: Callable[[str], None] = say) -> Choices:
+        """The same for a training: one that starts from a file, and names no scene, is about that file's scene."""
+        start = Path(str(self.values().get("init", "")))
+        found = self._scene_of(start) if start.is_file() else None
+        if found is None:
+            return self
+        tell(f"scene {found[0]}, that of the run directory that {start} lies in (--scene names another)")
+        return replace(self, scene=found[0])
+
+    def _scene_of(self, path: Path) -> tuple[str, Path] | None:
+        """The scene and the config.toml of the run directory that a file lies in; None: a scene is named."""
+        from splatwizard_core.runs.config import read_config_file
+
+        if self.scene is not None or (self.config_file and "scene" in read_config_file(self.config_file)):
+            return None
+        config = path.absolute().parent / "config.toml"
+        scene = read_config_file(config).get("scene") if config.is_file() else None
+        if not isinstance(scene, str) or not scene:
+            raise click.UsageError(
+                f"nothing says which scene {path} is of (no config.toml of a run lies beside it): name it by --scene"
+            )
+        return scene, config
+
     def with_rate_of(self, directory: Path, plugins: PluginManager) -> Choices:
         """The same for a run directory: its config.toml, with what another rate point would change in it."""
         from splatwizard_core.runs.config import read_config_file, resolve
@@ -216,6 +252,7 @@ def open_training_session(chosen: Choices, plugins: PluginManager) -> tuple[list
     """
     from splatwizard_core.runs.device import device_reason
 
+    chosen = chosen.of_start()
     resolved = chosen.resolve(plugins)
     _warn_of_equal_rates(resolved)
     session = open_session(resolved[0], plugins)
