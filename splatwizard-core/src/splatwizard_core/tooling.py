@@ -18,7 +18,7 @@ MODULES = {
     "runs.lock": "directory_lock",
     "runs.config": "ResolvedConfig resolve",
     "runs.directory": "OWN_FILES RunRequest run_directory",
-    "runs.pretrained": "base_config first_scene make_method named_scenes useful_starts",
+    "runs.pretrained": "base_config first_scene for_starts make_method named_scenes useful_starts",
     "runs.training": "cached_directory",
     "runs.run": "run train_in",
     "runs.decode": "export_model exporter_of open_model",

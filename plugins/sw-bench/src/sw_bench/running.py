@@ -24,7 +24,7 @@ from splatwizard_core.tooling import (
     print_table,
     say,
 )
-from sw_bench.cells import Cell, Job, Layout, cells_of, jobs_of, prepare, training_key
+from sw_bench.cells import Cell, Job, Layout, cells_of, differing_bases, jobs_of, prepare, training_key
 from sw_bench.display import Lines, LiveTable
 from sw_bench.estimates import Estimates
 from sw_bench.executor import Executor, Site
@@ -164,6 +164,8 @@ def bench_plan(wanted: Wanted, given: Mapping[str, Any]) -> int:
         states |= {cell: State.BEGUN for cell in cells if states[cell] is State.FINISHED}
     unfinished = [cell for cell in cells if states[cell] is not State.FINISHED]
     jobs = jobs_of(unfinished, layout, plugins)
+    for line in differing_bases(cells, plugins):
+        say(f"note: {line}")
     if given["dry_run"]:
         from sw_bench.dry_run import dry_run
 

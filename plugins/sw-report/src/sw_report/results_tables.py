@@ -7,6 +7,7 @@ from typing import Any
 
 from sw_report import numbers
 from sw_report.aggregate import DatasetTable, MeanRow
+from sw_report.bases import STEPS_NOTE, bases_notes
 from sw_report.blocks import Cell, Row, Table, columns, row
 from sw_report.declared import metric_style
 from sw_report.distortion import BdCell, BdTable
@@ -54,7 +55,7 @@ def runs_table(runs: Sequence[Run]) -> Table:
         cells += [
             Cell(numbers.megabytes(run.size), f"{run.size:,.0f} bytes"),
             numbers.counts({unit: round(n) for unit, n in run.counts.items()}),
-            numbers.count(facts.train.steps),
+            facts.train.all_steps(),
             *(_measured(run, column, marks) for column in MEASURED),
         ]
         rows.append(row(cells))
@@ -71,6 +72,9 @@ def runs_table(runs: Sequence[Run]) -> Table:
     if any("fit" in run.facts.flags for run in runs):
         notes.append("The test views are training views too: scores are quality of fit, not of novel views.")
     notes += uncompressed_notes(run.facts for run in runs)
+    if any(run.facts.train.pretraining for run in runs):
+        notes.append(STEPS_NOTE)
+        notes += bases_notes((run.facts for run in runs), {id(run.facts): run.variant for run in runs})
     if several:
         notes.append(numbers.SEEDS_NOTE)
     if any(facts.contended for run in runs for facts in run.seeds):

@@ -82,7 +82,8 @@ class Choices:
             for method in map(plugins.methods.load, self.method_names(plugins))
             for rate in ([None] if self.rate is None else rate_points(method, self.rate))
         ]
-        return [checked_start(plugins, each) for each in _without_unused_starts(plugins, found)]
+        found = _with_shared_starts(plugins, _without_unused_starts(plugins, found))
+        return [checked_start(plugins, each) for each in found]
 
     def settled(
         self, found: list[ResolvedConfig], plugins: PluginManager, scene: Callable[[ResolvedConfig], Scene],
@@ -101,6 +102,10 @@ class Choices:
                 why = f"the plan scaled down for {pixels:,} training pixels"
                 tell(f"preset quick: {why} (--preset paper runs it in full)")
         tell_data_set_values(found, tell)
+        for each in {each.method: each for each in found}.values():
+            shared = [f"{k}={v}" for k, v in each.pretrained.items() if f"pretrained.{k}" not in each.provenance]
+            if shared:
+                tell(f"{each.method}: the trained scene that it starts from has {', '.join(shared)} too")
         return found
 
     def resolve_one(self, plugins: PluginManager) -> ResolvedConfig:
@@ -229,6 +234,21 @@ def _without_unused_starts(plugins: PluginManager, found: list[ResolvedConfig]) 
                 say(f"{method} does not start from a trained scene: '{what}' is for the others")
             found = [replace(each, **{what: nothing[what]}) if each.method in useless else each for each in found]
     return found
+
+
+def _with_shared_starts(plugins: PluginManager, found: list[ResolvedConfig]) -> list[ResolvedConfig]:
+    """Let what --set and --config say of several methods also train the scenes that some of them start from."""
+    from splatwizard_core.runs.pretrained import for_starts
+
+    if len({each.method for each in found}) < 2:
+        return found
+    settled = []
+    for each in found:
+        layers = ("preset ", "data set ", "rate ")
+        given = [key for key, source in each.provenance.items() if not source.startswith(layers)]
+        more = {key.removeprefix("pretrained."): value for key, value in for_starts(plugins, each, given).items()}
+        settled.append(replace(each, pretrained={**more, **each.pretrained}))
+    return settled
 
 
 def open_session(resolved: ResolvedConfig, plugins: PluginManager) -> Session:
