@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from splatwizard_core.tooling import load_plugins
 from sw_report.configurations import described, differing, texts
+from sw_report.declared import encoding_keys
 from sw_report.facts import RunFacts
 
 MOST_KEYS = 3
@@ -58,6 +58,5 @@ def _started(method: str, config: dict[str, Any] | None, steps: int | None, file
 
 def _training(method: str, config: dict[str, Any]) -> dict[str, str]:
     """Return the values that training depends on, by dotted key: not what only encodes."""
-    plugins = load_plugins()
-    only_encodes = plugins.methods.load(method).Config.ENCODING if method in plugins.methods else ("codec",)
+    only_encodes = encoding_keys(method)
     return texts({key: value for key, value in config.items() if key not in only_encodes})
