@@ -38,7 +38,7 @@ def test_every_table_is_what_its_records_say(tools):
 
 def test_a_table_that_was_changed_by_hand_is_found(tools):
     page = tools.PAGES[1].read_text("utf-8")
-    changed = re.sub(r"(<!-- table brief demo -->.*?)\d\d\.\d\d", r"\g<1>99.99", page, count=1, flags=re.S)
+    changed = re.sub(r"(<!-- table brief lego -->.*?)\d\d\.\d\d", r"\g<1>99.99", page, count=1, flags=re.S)
     assert changed != page
     assert tools.filled(changed) == page
 

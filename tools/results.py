@@ -1,4 +1,4 @@
-"""Make every table and plot of measured runs in README.md, docs/results.md and docs/formats.md from docs/records.
+"""Make every table and plot of measured runs in README.md and the pages of docs from docs/records.
 
     python tools/results.py collect OUT...       # records of all runs under OUT into docs/records, then what follows
     python tools/results.py tables               # the tables and plots alone
@@ -30,7 +30,7 @@ from result_records import FROM, MIB, RECORDS, ROOT, extract, merged, read, writ
 
 from splatwizard_core.tooling import load_plugins
 
-PAGES = (ROOT / "docs" / "results.md", ROOT / "README.md", ROOT / "docs" / "formats.md")
+PAGES = tuple(ROOT / page for page in ("docs/results.md", "README.md", "docs/formats.md", "docs/questions.md"))
 MARKED = re.compile(r"(<!-- (?:table|(?=plot)) ?(\w[\w-]*) (\w[\w.-]*) -->\n).*?(<!-- end -->)", re.S)
 
 
@@ -67,6 +67,33 @@ def cost_table(records: Rows) -> list[list[str]]:
             spread([r.render_bytes / MIB for r in group], 0),
             spread([r.default_fps for r in quiet], 0), spread([r.fps for r in quiet], 0),
             first.rasterizer or NONE, str(len(group)),
+        ])  # fmt: skip
+    return rows
+
+
+def needs_table(records: Rows) -> list[list[str]]:
+    """What a training takes of a GPU, by method and size of its result, the smallest memory first."""
+    rows = [
+        [
+            "method",
+            "rate",
+            "Gaussians",
+            "anchors",
+            "training, MiB",
+            "rendering, MiB",
+            "training, s",
+            "its start, s",
+            "n",
+        ]
+    ]
+    groups = [g for g in points([r for r in records if r.default_rate]) if any(r.train_bytes for r in g)]
+    for group in sorted(groups, key=lambda g: statistics.fmean(r.train_bytes for r in g if r.train_bytes)):
+        timed = [r for r in group if r.alone] or group
+        rows.append([
+            title(group), rate(group), spread([r.gaussians for r in group], 0), spread([r.anchors for r in group], 0),
+            spread([None if r.train_bytes is None else r.train_bytes / MIB for r in group], 0),
+            spread([r.render_bytes / MIB for r in group], 0),
+            spread([r.train_s for r in timed], 0), spread([r.start_s for r in timed], 0), str(len(group)),
         ])  # fmt: skip
     return rows
 
@@ -131,7 +158,7 @@ def started_by(group: Rows) -> str:
 
 TABLES: dict[str, Callable[[Rows], list[list[str]]]] = {
     "quality": quality_table, "cost": cost_table, "brief": brief_table, "formats": formats_table,
-    "starts": starts_table,
+    "starts": starts_table, "needs": needs_table,
 }  # fmt: skip
 
 

@@ -43,6 +43,7 @@ MODULES = {
     "cli.complete": "SCENE name_of",
     "cli.paths": "EXISTING OUTPUT_FILE OUTPUT_FOLDER existing_file",
     "cli.setup": "Choices open_session takes_choices",
+    "plugins.remedies": "as_installed",
 }
 """Module of the core -> the names that it lends. `tooling.pyi` repeats them for type checkers."""
 BASE = {"files": "bytes_with_named file_sha256 new_folder write_atomic write_json", "progress": "Bar"}

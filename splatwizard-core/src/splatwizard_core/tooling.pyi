@@ -43,6 +43,7 @@ from splatwizard_core.plugins.loading import PluginInfo as PluginInfo
 from splatwizard_core.plugins.manager import PluginManager as PluginManager
 from splatwizard_core.plugins.manager import load_plugins as load_plugins
 from splatwizard_core.plugins.registry import Entry as Entry
+from splatwizard_core.plugins.remedies import as_installed as as_installed
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer as NegotiatedRasterizer
 from splatwizard_core.runs.config import ResolvedConfig as ResolvedConfig
 from splatwizard_core.runs.config import resolve as resolve

@@ -20,6 +20,7 @@ from splatwizard_core.errors import PluginError, TaskError
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.plugins.catalogue import package_of
 from splatwizard_core.plugins.origins import Origins
+from splatwizard_core.plugins.remedies import as_installed
 from splatwizard_native import FULL, DiskFullError, ForeseenError
 
 if TYPE_CHECKING:
@@ -104,12 +105,21 @@ def cli() -> None:
     """
 
 
+class _AsInstalled(logging.Formatter):
+    """Messages whose advice to install something works here."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return as_installed(super().format(record))
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `sw` and return its exit status: 0, 2 wrong input, 1 failure, 130 interrupted."""
     open_streams()
     arguments = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in arguments
-    logging.basicConfig(level=logging.DEBUG if debug else logging.WARNING, format="%(levelname)s: %(message)s")
+    handler = logging.StreamHandler()
+    handler.setFormatter(_AsInstalled("%(levelname)s: %(message)s"))
+    logging.basicConfig(level=logging.DEBUG if debug else logging.WARNING, handlers=[handler])
     for noisy in ("PIL", "torch", "matplotlib"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
     with ended_like_ctrl_c():
@@ -172,4 +182,4 @@ def _culprit(error: BaseException, arguments: Sequence[str]) -> str:
 
 def _say(text: str) -> None:
     with contextlib.suppress(OSError):  # nobody reads it: the exit status must do
-        print(without_orders(text), file=sys.stderr, flush=True)
+        print(without_orders(as_installed(text)), file=sys.stderr, flush=True)

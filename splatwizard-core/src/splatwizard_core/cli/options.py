@@ -13,6 +13,7 @@ from splatwizard_core.cli.complete import KEY, PRESET, RATE, SCENE, name_of
 from splatwizard_core.cli.paths import OUTPUT_FOLDER
 from splatwizard_core.cli.streams import without_orders
 from splatwizard_core.plugins.guards import prints_to_stderr
+from splatwizard_core.plugins.remedies import as_installed
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -133,7 +134,7 @@ def options(*decorators: Callable[[F], F]) -> Callable[[F], F]:
 
 def say(message: str) -> None:
     """Print a line for the user on stderr: stdout holds results only."""
-    click.echo(without_orders(message), err=True)
+    click.echo(without_orders(as_installed(message)), err=True)
 
 
 def print_json(content: Any) -> None:
@@ -176,7 +177,7 @@ def console() -> Console:
             raise BrokenPipeError
 
         def render_str(self, text: str, **options: Any) -> Text:
-            return super().render_str(without_orders(text), **options)
+            return super().render_str(without_orders(as_installed(text)), **options)
 
     # A pipe has no width: 80 columns would break tables that are meant to be searched.
     return SafeConsole(highlight=False, width=None if sys.stdout.isatty() else 160)
