@@ -52,8 +52,8 @@ def view(
     """Look at decoded models in the browser, drawn by this machine; two side by side.
 
     PATH is a .swz, a .ply, a run directory, or a folder with run directories below it. The cameras are those of
-    --scene, else of the run's scene; without either they are made up around the Gaussians. Needs viser:
-    pip install 'sw-viewer[viser]'; --html does not.
+    --scene, else of the run's scene; without either they are made up around the Gaussians. Needs viser,
+    the extra [viser] of sw-viewer; --html does not.
     """
     from sw_viewer.entries import about_page, find_all_entries, fixed_gaussians, open_entry
 

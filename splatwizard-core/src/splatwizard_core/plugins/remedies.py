@@ -51,16 +51,21 @@ def _local(found: re.Match[str]) -> str:
         if specs and not (is_ours(spec.name) or spec.specifier or word.startswith("'")):
             break
         specs.append(spec)
-    if not any(is_ours(spec.name) for spec in specs):
+    if "-e" in options.split() or not any(is_ours(spec.name) for spec in specs):  # -e: the folder is named already
         return found[0].replace("pip", pip(), 1)
     rest = "".join(f" {word}" for word in words[len(specs) :])
     root = checkout()
     if root is None:
         where = wheels()
-        told = "" if where else f" ({WHEELS}: the folder of the wheels that {CORE} was installed from)"
+        told = "" if where else f" ({WHEELS}: the folder of the wheels that {CORE} came from)"
         named = " ".join(f"'{spec}'" for spec in specs)
-        return " ".join(filter(None, [pip(), "install", options, "--find-links", where or WHEELS, named])) + told + rest
-    pull = f"git -C {_shown(root)} pull && " if any(_is_newer(spec, root) for spec in specs) else ""
+        return (
+            " ".join(filter(None, [pip(), "install", options, "--find-links", shlex.quote(where or WHEELS), named]))
+            + told
+            + rest
+        )
+    newer = {"--upgrade"} == set(options.split()) or any(_is_newer(spec, root) for spec in specs)
+    pull = f"git -C {shlex.quote(_shown(root))} pull && " if newer else ""
     here, others = sources(specs, root)
     parts = [f"-e {shlex.quote(path)}" for path in here] + [f"'{spec}'" for spec in others]
     options = " ".join(word for word in options.split() if word != "--upgrade")
