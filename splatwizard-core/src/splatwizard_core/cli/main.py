@@ -148,6 +148,13 @@ def _report(error: BaseException, arguments: Sequence[str], *, debug: bool) -> i
     if isinstance(error, click.exceptions.NoArgsIsHelpError):
         _say(error.format_message())
         return error.exit_code
+    if isinstance(error, click.NoSuchOption):
+        from splatwizard_core.cli.unknown_option import set_hint
+
+        hint = set_hint(error, arguments)
+        if hint is not None:
+            _say(f"error: {hint}")
+            return error.exit_code
     if isinstance(error, click.ClickException):
         context = getattr(error, "ctx", None)
         hint = f" (`{context.command_path} --help`)" if context is not None and context.command_path != "sw" else ""
