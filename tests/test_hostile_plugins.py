@@ -173,7 +173,7 @@ def commands(street: Site, run) -> dict[str, Done]:
     return dict(zip(COMMANDS, street.sw_each([line.split() for line in COMMANDS]), strict=True))
 
 
-RENDER = "render scene.swz --set raster.prefer=['lightning','exits','lies'] --out pictures --json"
+RENDER = "render scene.swz --scene demo:tiny --set raster.prefer=['lightning','exits','lies'] --out pictures --json"
 SYNTH, INFO, EXPORT = "data synth photos --size tiny", "info photos --json", "export scene.swz scene.ply --json"
 FAILING = {
     "export scene.swz x.bin --format export-raises":

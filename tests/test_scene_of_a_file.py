@@ -10,6 +10,8 @@ import click
 import pytest
 from sw_bench.running import plan_of_options
 
+from splatwizard_core import steps as api
+from splatwizard_core.api import UserInputError
 from splatwizard_core.cli.main import main
 from splatwizard_core.cli.setup import Choices
 from splatwizard_core.plugins import load_plugins
@@ -69,9 +71,17 @@ def test_a_file_that_nothing_is_known_of_is_not_put_on_a_default_scene(command, 
     assert [path.name for path in tmp_path.iterdir()] == ["photo.ply"]
 
 
+def test_from_python_it_is_the_same(run: Path, tmp_path: Path):
+    found = api.evaluate(run / "scene.swz")
+    assert "/white/" in found["protocol"]["id"]
+    shutil.copy(run / "scene.swz", tmp_path / "stray.swz")
+    with pytest.raises(UserInputError, match="nothing says which scene"):
+        api.evaluate(tmp_path / "stray.swz")
+
+
 def test_a_config_of_another_program_names_no_scene(tmp_path: Path):
     (tmp_path / "config.toml").write_text("colour = 'red'\n")
-    with pytest.raises(click.UsageError, match="nothing says which scene"):
+    with pytest.raises(UserInputError, match="nothing says which scene"):
         Choices().of_file(tmp_path / "a.ply")
 
 

@@ -274,7 +274,14 @@ def test_an_ordinary_run_takes_what_others_started_from(toy_plugins, tmp_path):
 def test_a_finished_student_is_encoded_from_its_directory(toy_plugins, tmp_path, capsys):
     _, directory = Run(toy_plugins, tmp_path / "out").train()
     assert main(["encode", str(directory), "--out", str(tmp_path / "x.swz"), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["bytes"] == (tmp_path / "x.swz").stat().st_size
+    facts, size = json.loads(capsys.readouterr().out), (tmp_path / "x.swz").stat().st_size
+    assert facts["bytes"] == size
+    assert facts["ratio"] == facts["float32_bytes"] / size
+    assert main(["eval", str(tmp_path / "x.swz"), "--scene", "demo:tiny", "--no-speed", "--json"]) == 0
+    assert facts["psnr"] == pytest.approx(json.loads(capsys.readouterr().out)["metrics"]["psnr"]["mean"])
+    assert main(["encode", str(directory), "--out", str(tmp_path / "x.swz"), "--no-psnr"]) == 0
+    told = capsys.readouterr().out
+    assert f"{size:,} bytes, {1 / facts['ratio']:.1f} x larger than its parameters as float32, in " in told  # a toy
 
 
 def sw(arguments: list[str], **options: object) -> "subprocess.Popen[str]":

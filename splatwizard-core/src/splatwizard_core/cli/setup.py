@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from splatwizard_core.cli.options import say
-from splatwizard_core.errors import ConfigError
+from splatwizard_core.errors import ConfigError, UserInputError
 
 TINY = 500_000  # pixels of all training pictures: the published plans take half an hour of a CPU for nothing
 
@@ -140,7 +140,7 @@ class Choices:
         """The same for what looks at a file on a scene: where none is named, that of the file's run directory, as it
         was read there.
 
-        Raises click.UsageError if nothing says whose file it is: on a default scene its numbers would be about nothing.
+        Raises UserInputError if nothing says whose file it is: on a default scene its numbers would be about nothing.
         """
         found = self._scene_of(path)
         if found is None:
@@ -167,7 +167,7 @@ class Choices:
         config = path.absolute().parent / "config.toml"
         scene = read_config_file(config).get("scene") if config.is_file() else None
         if not isinstance(scene, str) or not scene:
-            raise click.UsageError(
+            raise UserInputError(
                 f"nothing says which scene {path} is of (no config.toml of a run lies beside it): name it by --scene"
             )
         return scene, config
