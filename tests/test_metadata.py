@@ -61,4 +61,5 @@ def test_the_bibtex_of_the_docs_is_what_the_citation_says():
         fields["title"], fields["version"], fields["date-released"], fields["license"]
     )  # fmt: skip
     assert f"name: {told['author']}\n" in CITATION
-    assert f"arXiv:{dict(re.findall(r'(\w+) += {+([^{}]+)}+', paper))['eprint']}" in CITATION
+    eprint = dict(re.findall(r"(\w+) += \{+([^{}]+)\}+", paper))["eprint"]
+    assert f"arXiv:{eprint}" in CITATION
