@@ -72,7 +72,7 @@ def cost_table(records: Rows) -> list[list[str]]:
 
 
 def needs_table(records: Rows) -> list[list[str]]:
-    """What a training takes of a GPU, by method and size of its result, the smallest memory first."""
+    """Memory and seconds of trainings on a GPU, by method and size of the result, the smallest memory first."""
     rows = [
         [
             "method",

@@ -22,6 +22,14 @@ if TYPE_CHECKING:
     from sw_report.runs import Run
 
 
+def _columns(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[str]:
+    """Complete the last word of the list."""
+    from sw_report.selection import KNOWN
+
+    before, comma, last = incomplete.rpartition(",")
+    return [before + comma + name for name in ("all", "paper", *KNOWN) if name.startswith(last)]
+
+
 @click.command(short_help="tables, curves, BD-rates, one HTML page")
 @click.argument("folders", metavar="DIR...", nargs=-1, required=True, type=click.Path())
 @options(
@@ -39,7 +47,7 @@ if TYPE_CHECKING:
     click.option("--markdown", "form", flag_value="markdown", help="Print Markdown tables."),
     click.option("--json", "form", flag_value="json", help="Print one JSON object: runs, means, BD values, notes."),
     click.option("--jsonl", "form", flag_value="jsonl", help="Print one JSON object a run."),
-    click.option("--columns", metavar="NAME[,NAME]",
+    click.option("--columns", metavar="NAME[,NAME]", shell_complete=_columns,
                  help="Columns of the tables: method, rate, scenes, seeds, psnr, ssim, lpips (or any metric), size, "
                  "primitives, steps, train, encode, decode, fps; `all`, or `paper`: method, rate, psnr, ssim, lpips, "
                  "size.  [default: paper with --latex, else all]"),
