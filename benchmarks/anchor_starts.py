@@ -5,7 +5,8 @@
         --gpus 0,1,2,3 --jobs 20
 
 On --scene each method runs at its lowest and its highest rate point with --seeds seeds from the default start, and with
-one seed from each number of --starts random points; --curves methods run at every rate point with one seed. On --lego
+one seed from each number of --starts random points (the first seed itself where the default is as many); --curves
+methods run at every rate point with one seed. On --lego
 (a small scene, left out where it is not given) the highest rate point alone, with --lego-seeds seeds. The background is
 black, as the authors have it.
 
@@ -21,6 +22,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import statistics
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -34,14 +36,24 @@ from sw_report.published_files import read_published
 from sweep_cells import Cell, add_options, chosen, print_outcomes, run_cells
 
 from splatwizard_core.plugins import load_plugins
+from splatwizard_core.runs.config import resolve
 
 METHODS, CURVES, STARTS = "hac,hac-plus,cat-3dgs", "hac,hac-plus", "10000,100000"
 KEY = "init_points"
 BLACK = "background=black"
 
 
+@functools.cache
+def default_points(method: str, scene: str, preset: str) -> int:
+    """Random points that a method starts from on this scene if nothing is said."""
+    plugins = load_plugins()
+    return resolve(plugins.methods.load(method), preset, scene=scene, plugins=plugins).scene.init_points
+
+
 def started(cell: Cell, points: int) -> Cell:
-    """The run with the first seed from another number of random points."""
+    """The run with the first seed from so many random points: that of `cell` where it starts from as many."""
+    if points == default_points(cell.method, cell.scene, cell.preset):
+        return dataclasses.replace(cell, label=cell.method, seed=0)
     sets = (*cell.sets, f"{KEY}={points}")
     return dataclasses.replace(cell, label=f"{cell.method}-{points}-points", seed=0, sets=sets)
 

@@ -81,7 +81,7 @@ class FreshEnvironment:
 
     def run(self, *args: str, check: bool = True, **env: str) -> subprocess.CompletedProcess[str]:
         """Run `sw ARGS` there, away from the source tree."""
-        done = subprocess.run(self._command(args), **self._surroundings(env), capture_output=True, timeout=300)
+        done = subprocess.run(self._command(args), **self._surroundings(env), capture_output=True, timeout=1200)
         if check and done.returncode:
             raise AssertionError(f"sw {' '.join(args)} exited {done.returncode}:\n{done.stdout}\n{done.stderr}")
         return done
@@ -89,7 +89,7 @@ class FreshEnvironment:
     def python_c(self, program: str, *args: str) -> None:
         """Run a program in its interpreter, away from the source tree; AssertionError with its output if it fails."""
         done = subprocess.run(
-            [str(self.python), "-c", program, *args], **self._surroundings({}), capture_output=True, timeout=300
+            [str(self.python), "-c", program, *args], **self._surroundings({}), capture_output=True, timeout=1200
         )
         if done.returncode:
             raise AssertionError(f"the program exited {done.returncode}:\n{done.stdout}\n{done.stderr}")

@@ -69,7 +69,7 @@ class Site:
         kept = {k: v for k, v in os.environ.items() if not k.startswith(("SW_", "_SW_"))}
         return subprocess.run(
             [sys.executable, *arguments], cwd=self.folder, env={**kept, "PYTHONPATH": path, **env}, input=given,
-            capture_output=True, text=True, timeout=300, check=False,
+            capture_output=True, text=True, timeout=1200, check=False,
         )  # fmt: skip
 
     def listed(self, **env: str) -> Listed:

@@ -23,7 +23,7 @@ def doctor(*arguments: str, **env: str) -> subprocess.CompletedProcess[str]:
         env["PYTHONPATH"] = os.pathsep.join(filter(None, (env["PYTHONPATH"], os.environ.get("PYTHONPATH"))))
     return subprocess.run(
         [sys.executable, "-m", "splatwizard_core", "doctor", *arguments],
-        capture_output=True, text=True, timeout=500, env={**kept, **env}, check=False,
+        capture_output=True, text=True, timeout=1200, env={**kept, **env}, check=False,
     )  # fmt: skip
 
 

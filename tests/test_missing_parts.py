@@ -119,7 +119,7 @@ def test_a_codec_that_is_left_out_of_another_process(file, stranger):
     program = "import sys; from splatwizard_core.cli.main import main; sys.exit(main(sys.argv[1:]))"
     done = subprocess.run(
         [sys.executable, "-c", program, "decode", str(file), "--repeats", "0"], capture_output=True, text=True,
-        env={**os.environ, "SW_PLUGINS": OURS, "PYTHONPATH": ":".join(sys.path)}, timeout=300,
+        env={**os.environ, "SW_PLUGINS": OURS, "PYTHONPATH": ":".join(sys.path)}, timeout=1200,
     )  # fmt: skip
     assert done.returncode == 2
     assert "needs coder 'martian', which is not installed: sw-martian 1.2 is there, but SW_PLUGINS" in done.stderr

@@ -54,7 +54,7 @@ class Reader:
             "pip": [python, "-m", "pip", *words, *OFFLINE],
         }[program]
         surroundings = {**self.environment._surroundings({}), "cwd": self.folder}
-        done = subprocess.run(command, **surroundings, capture_output=True, timeout=300, check=False)
+        done = subprocess.run(command, **surroundings, capture_output=True, timeout=1200, check=False)
         assert done.returncode == 0, (
             f"`{line}` ended with {done.returncode}:\n{done.stdout[-2500:]}{done.stderr[-800:]}"
         )

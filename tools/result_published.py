@@ -14,24 +14,33 @@ from result_records import FROM, RECORDS, SmallRecord, read
 from sw_report.published import standing_for
 from sw_report.published_files import Figure, read_published
 
-FULL_SCENES = {"lego": "nerf_synthetic"}  # scene of the records -> data set whose scene of that name it is made from
+SCENES = {"lego": ("nerf_synthetic", ["lego"]), "chair": ("nerf_synthetic", ["chair", "chair-black"])}
+"""Published scene -> its data set, and the records of it, or of what is cut down from it."""
 HEAD = (
-    "method", "rate", "PSNR dB, published", "here", "SSIM, published", "here", "bytes, published", "here",
-    "Gaussians, published", "here", "n", "source", "differs besides",
+    "method", "rate", "PSNR dB, published", "here", "SSIM, published", "here", "LPIPS, published", "here",
+    "bytes, published", "here", "Gaussians, published", "here", "n", "source", "differs besides",
 )  # fmt: skip
 
 
-def table(scene: str, records_at: Path = RECORDS) -> str:
+BRIEF = {"method": 0, "rate": 1, "PSNR dB": 3, "published": 2, "bytes": 9, "published bytes": 8, "n": 12}
+"""Column of the short form -> its place in a whole row."""
+
+
+def table(scene: str, records_at: Path = RECORDS, *, brief: bool = False) -> str:
     """Write a row for each published figure with records. Raises SystemExit for a scene of no data set."""
-    if scene not in FULL_SCENES:
-        raise SystemExit(f"no published scene is known for '{scene}'; one of {', '.join(FULL_SCENES)}")
-    records = read(records_at / f"{scene}.jsonl")
-    figures = [f for f in read_published() if (f.dataset, f.scene) == (FULL_SCENES[scene], scene) and f.rate]
+    if scene not in SCENES:
+        raise SystemExit(f"no published scene is known for '{scene}'; one of {', '.join(SCENES)}")
+    dataset, names = SCENES[scene]
+    records = [record for name in names for record in read(records_at / f"{name}.jsonl")]
+    figures = [f for f in read_published() if (f.dataset, f.scene) == (dataset, scene) and f.rate]
     order = list(TITLES)
     figures.sort(key=lambda f: (order.index(f.method) if f.method in order else len(order), -(f.bytes or 0)))
     rows = [_row(figure, group, records) for figure in figures if (group := _group(figure, records))]
-    lines = [f"| {' | '.join(cells)} |" for cells in (HEAD, *rows)]
-    return "\n".join([lines[0], "|---" * len(HEAD) + "|", *lines[1:], ""])
+    whole: Sequence[Sequence[str]] = [HEAD, *rows]
+    if brief:
+        whole = [list(BRIEF), *([row[place] for place in BRIEF.values()] for row in rows)]
+    lines = [f"| {' | '.join(cells)} |" for cells in whole]
+    return "\n".join([lines[0], "|---" * len(whole[0]) + "|", *lines[1:], ""])
 
 
 def _group(figure: Figure, records: Rows) -> Rows:
@@ -47,6 +56,7 @@ def _row(figure: Figure, group: Rows, records: Rows) -> list[str]:
         TITLES.get(figure.method, figure.method), figure.rate or NONE,
         _shown(figure.psnr, 2), spread([r.psnr for r in group], 2),
         _shown(figure.ssim, 4), spread([r.ssim for r in group], 4),
+        _shown(figure.lpips, 4), spread([r.lpips for r in group], 4),
         _shown(figure.bytes, 0), spread([r.bytes for r in group], 0),
         _shown(figure.gaussians, 0), spread([r.gaussians for r in group], 0), str(len(group)),
         f"{figure.source}, {figure.year}{'' if figure.verified or 're-read' in figure.source else ' (not re-read)'}",

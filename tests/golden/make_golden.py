@@ -291,7 +291,7 @@ CASES: dict[str, Case] = {
     "compact3dgs_one_v1": (
         "compact3dgs",
         "r1",
-        {**SMALL_COMPACT, "codec.settings.coder": "range"},
+        {**SMALL_COMPACT, "codec.settings.coder": "range", "codec.settings.grid_factor": 1},
         lambda: compact_gaussians(1, {**SMALL_COMPACT, "grid.halvings": 2}),
     ),
     "chimerags_v1": ("chimerags", "r2", SMALL_VQ, lambda: masked(32, 12)),

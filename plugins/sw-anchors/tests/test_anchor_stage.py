@@ -178,6 +178,21 @@ def test_a_rate_that_never_decays_is_constant():
     assert stage.learning_rates(50)["mlp_cov"] == pytest.approx(0.004)
 
 
+def test_the_opacity_network_may_wait_until_anchors_are_judged():
+    lr = {"mlp_opacity_early": 0.02, "early_until": 1500}
+    plain, early = AnchorStage(AnchorParams()), AnchorStage(AnchorParams(lr=lr))
+    before, after = plain.learning_rates(1500), plain.learning_rates(1501)
+    assert early.learning_rates(1500) == {**before, "mlp_opacity": pytest.approx(0.02 * before["mlp_opacity"])}
+    assert early.learning_rates(1501) == after
+    shortened = AnchorStage(AnchorParams(lr=lr, iterations=300, scale_schedule=True))  # a hundredth of 30,000 steps
+    assert shortened.learning_rates(15)["mlp_opacity"] < shortened.learning_rates(16)["mlp_opacity"]
+
+
+def test_an_opacity_network_that_does_not_wait_leaves_the_identity_of_a_training():
+    assert "mlp_opacity_early" not in CodedAnchorParams().identity()["lr"]
+    assert CodedAnchorParams(lr={"mlp_opacity_early": 0.02}).identity()["lr"]["mlp_opacity_early"] == 0.02
+
+
 def test_pictures_may_begin_small():
     plain, small = AnchorParams(), AnchorParams(pictures={"schedule": "dash"})
     scene = scene_of()

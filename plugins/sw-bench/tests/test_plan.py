@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from sw_bench.plan import Values, read_plan, set_words
+from sw_bench.plan import Values, checked_plan, read_plan, set_words
 
 from splatwizard_core.api import ConfigError
 
@@ -110,3 +110,9 @@ def test_a_plan_that_cannot_be_read_is_named(tmp_path):
     path.write_bytes(b"\xff\xfe")
     with pytest.raises(ConfigError, match="is not valid TOML"):
         read_plan(path)
+
+
+@pytest.mark.parametrize("seeds", [[2.0], list(range(1001)), ["1"], [True]])
+def test_seeds_are_whole_numbers_and_not_thousands(seeds):
+    with pytest.raises(ConfigError, match="seeds"):
+        checked_plan({"methods": ["3dgs"], "scenes": ["demo:tiny"], "seeds": seeds}, "plan")

@@ -74,6 +74,37 @@ def test_a_coarser_threshold_makes_a_smaller_file():
     assert sizes[2] < 0.9 * sizes[0]
 
 
+def test_steps_of_the_grid_are_no_shorter_than_asked_and_round_to_the_nearest():
+    table = make().color.grid.table.detach()
+    values = {"codec__settings__grid_threshold": 0, "codec__settings__grid_step": 0.25}
+    found = decoded(encoded(make(), **values)).color.grid.table.detach()
+    torch.testing.assert_close(found, torch.round(table / 0.25) * 0.25, atol=1e-5, rtol=0)
+    twice = decoded(encoded(make(), **values, codec__settings__grid_factor=2)).color.grid.table.detach()
+    torch.testing.assert_close(twice, torch.round(table / 0.5) * 0.5, atol=1e-5, rtol=0)
+    published = {"codec__settings__grid_threshold": 0}
+    shorter = encoded(make(), **published, codec__settings__grid_step=1e-4)  # than the range / 255
+    assert shorter == encoded(make(), **published)
+
+
+def test_the_factor_of_a_rate_point_multiplies_the_threshold():
+    twice = encoded(make(), codec__settings__grid_threshold=0.2, codec__settings__grid_factor=2)
+    assert twice == encoded(make(), codec__settings__grid_threshold=0.4)
+
+
+@pytest.mark.parametrize(("threshold", "step"), [(0.5, 0.45), (1.0, 0.9), (1.5, 1.5)])
+def test_for_fewer_bytes_long_steps_change_the_grid_less_than_zeros(threshold, step):
+    model = make(log2_size=10)
+    table = model.color.grid.table.detach()
+    sizes, errors = [], []
+    for values in ((threshold, 0), (0, step)):
+        settings = dict(zip(("codec__settings__grid_threshold", "codec__settings__grid_step"), values, strict=True))
+        file = written(model, **settings)
+        sizes.append(file.sections["grid"])
+        errors.append(float((decoded(file.to_bytes()).color.grid.table - table).square().mean()))
+    assert sizes[1] <= sizes[0]
+    assert errors[1] < 0.75 * errors[0]
+
+
 @pytest.mark.parametrize("form", FORMS)
 def test_the_file_renders_as_the_model_with_rounded_positions(form):
     model, cam = make(), front_camera()

@@ -82,7 +82,7 @@ def test_cameras_that_turn_at_one_place_differ_by_rounding_alone():
     assert assemble([View(camera, f"{i}") for i, camera in enumerate(found)]).extent < 1e-2
 
 
-def test_cameras_far_from_the_origin_keep_their_extent():
+def test_cameras_far_from_the_origin_keep_their_extent_and_are_moved():
     center, up = torch.tensor([2e5, 5e6, 0.0], dtype=torch.float64), torch.tensor([0.0, 0, 1])  # UTM: easting, northing
     found = []
     for angle in (i * math.pi / 4 for i in range(8)):
@@ -92,7 +92,8 @@ def test_cameras_far_from_the_origin_keep_their_extent():
         found.append(View(replace(camera, tau=tau), f"{angle}"))
     scene = assemble(found, split="all")
     assert scene.extent == pytest.approx(44, abs=1)  # float32 numbers of this size are 0.5 apart
-    assert scene.warnings == []
+    assert scene.origin[:2] == pytest.approx((2e5, 5e6), abs=1)
+    assert ["moved to a local origin at (" in line for line in scene.warnings] == [True]
 
 
 def test_a_view_without_picture_says_so():

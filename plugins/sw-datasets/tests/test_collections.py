@@ -182,14 +182,15 @@ def test_every_picture_of_a_mixed_bag_is_read_at_its_own_size_with_its_own_camer
             (other,) = (v.camera for v in exact.train + exact.test if v.name == name)
             assert (other.cx, other.cy) == pytest.approx([c / scale for c in colmap.params[-2:]] if i % 3 == 1 else
                                                          [c / scale for c in colmap.params[2:4]])  # fmt: skip
-            assert view.pixels.shape == (3, camera.height, camera.width)
-        assert "up to 3.5 px off the image centre" in centred.warnings[0]
-        assert exact.warnings == []
+            channels = 4 if name in ("right/001.png", "a b.png") and not options.get("images") else 3
+            assert view.pixels.shape == (channels, camera.height, camera.width)
+        assert "up to 3.5 px off the image centre" in centred.warnings[-1]
+        assert not any("principal point" in line for line in exact.warnings)
     by_name = {view.name: view for view in load(root).train + load(root).test}
     np.testing.assert_array_equal(by_name["left/001.png"].pixels[0].numpy(), (ramp >> 8).reshape(24, 32))
-    assert by_name["right/001.png"].pixels.unique().tolist() == [77]
+    assert by_name["right/001.png"].pixels[:3].unique().tolist() == [77]
     assert by_name["right/001.png"].mask.all()
-    assert by_name["a b.png"].pixels[:, 0, 0].tolist() == [9, 8, 7]
+    assert by_name["a b.png"].pixels[:, 0, 0].tolist() == [9, 8, 7, 255]
 
 
 class TestBungeeOwnLayout:
@@ -261,10 +262,7 @@ class TestBungeeOwnLayout:
             ({"poses": [[1.0] * 17]}, "1 poses, images has 40 pictures"),
             ({"poses": [[1.0] * 17] * 40}, "are not a rotation"),
             ({"poses": [[math.nan] * 17] * 40}, "row 0 is not finite"),
-            (
-                {"poses": [[1, 0, 0, 5, 9, 0, 1, 0, 5, 9, 0, 0, 1, 5, 9, 0, 1]] * 40},
-                "all cameras look in one direction",
-            ),
+            ({"poses": [[1, 0, 0, 5, 9, 0, 1, 0, 5, 9, 0, 0, 1, 5, 9, 0, 1]] * 40}, "15x10 px, its camera is 9x9"),
             ({"poses": [[1, 0, 0, 5, 0, 0, 1, 0, 5, 9, 0, 0, 1, 5, 9, 0, 1]] * 40}, "height, width, focal"),
             ({"poses": [[1, 0, 0, 5, 9, 0, 1, 0, 5, 9, 0, 0, -1, 5, 9, 0, 1]] * 40}, "mirrored"),
         ],

@@ -201,7 +201,9 @@ def test_binary_is_preferred_and_a_missing_part_is_named(colmap_folder):
     (folder / "cameras.txt").write_text("nonsense")
     read_model(folder)
     (folder / "points3D.bin").unlink()
-    with pytest.raises(SceneError, match=r"points3D\.bin \(or \.txt\) is missing"):
+    assert len(read_model(folder).points) == 0  # poses alone
+    (folder / "images.bin").unlink()
+    with pytest.raises(SceneError, match=r"images\.bin \(or \.txt\) is missing"):
         read_model(folder)
 
 

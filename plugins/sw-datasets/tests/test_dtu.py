@@ -61,7 +61,7 @@ def test_a_scan_is_recognised_and_read_by_its_rules(scan, load):
 
 
 def test_another_surface_data_set_in_that_layout_is_no_scan(scan, load):
-    assert load(scan("bmvs_bear")).protocol.id == "colmap/images/r-1/every8/black/pp-center/q8"
+    assert load(scan("bmvs_bear")).protocol.id == "colmap/images/r-1/every8/black/pp-center/q8/masked"
     assert "'scan7' is not a published scene of DTU" in load(scan("scan7")).warnings[0]
 
 

@@ -10,11 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
+from sw_datasets.picture_names import find_pictures, is_inside, list_pictures
 from sw_datasets.pictures import (
-    find_pictures,
     fitted_size,
-    is_inside,
-    list_pictures,
     load_mask,
     load_picture,
     picture_header,

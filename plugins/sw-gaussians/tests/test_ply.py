@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 from sw_gaussians.ply import export_ply, from_ply, load_ply, to_ply
-from sw_gaussians.ply_gaussians import property_names
+from sw_gaussians.ply_gaussians import file_parts, property_names
 
-from splatwizard_core.errors import BitstreamError, SceneError, UserInputError
+from splatwizard_core.errors import BitstreamError, SceneError, SplatwizardError, UserInputError
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.gaussians.splat_model import SplatModel
 
@@ -55,13 +55,77 @@ def test_round_trip_of_any_degree(tmp_path_factory, n, degree, seed):
     assert bits(loaded) == bits(model)
 
 
-def test_not_a_number_and_infinity_keep_their_bits(tmp_path):
-    model = random_model(3, 1, 0)
+def test_rows_that_mean_nothing_are_left_out_and_told(tmp_path, caplog):
+    model = random_model(8, 1, 0)
     with torch.no_grad():
-        model.opacity_logits[0] = math.inf
-        model.means[1, 2] = math.nan
+        model.opacity_logits[0], model.log_scales[0, 1] = math.inf, -math.inf  # these have a limit
+        model.means[1, 2], model.sh_rest[2, 1, 0], model.log_scales[3, 0] = math.nan, math.inf, math.inf
+        model.quats[4], model.quats[5, 0], model.opacity_logits[6] = 0.0, math.nan, math.nan
     export_ply(model, tmp_path / "m.ply")
-    assert bits(load_ply(tmp_path / "m.ply")) == bits(model)
+    loaded = load_ply(tmp_path / "m.ply")
+    assert loaded.num_rows == 2
+    assert torch.equal(loaded.means, model.means[[0, 7]])
+    assert loaded.opacities[0] > 0.99999
+    assert loaded.log_scales[0, 1] == -20
+    assert loaded.origin["left_out"] == {"not_finite": 5, "zero_rotation": 1}
+    told = "5 hold values that are no numbers, 1 have a rotation of zero"
+    assert f"m.ply: 6 Gaussians mean nothing and were left out: {told}" in caplog.text
+    with torch.no_grad():
+        model.means[:] = math.nan
+    export_ply(model, tmp_path / "m.ply")
+    with pytest.raises(SplatwizardError, match=r"m\.ply: all of its 8 Gaussians mean nothing"):
+        load_ply(tmp_path / "m.ply")
+
+
+def test_the_world_of_a_moved_scene_is_kept_and_gone_back_to_in_doubles(tmp_path):
+    model = random_model(50, 1, 0)
+    model.origin = {"world_origin": [448262.3, 5411932.7, 35.0]}
+    export_ply(model, tmp_path / "local.ply")
+    assert b"comment world_origin 448262.3 5411932.7 35.0\n" in (tmp_path / "local.ply").read_bytes()
+    assert bits(load_ply(tmp_path / "local.ply")) == bits(model)
+    model.origin = {**model.origin, "as_world": True}
+    export_ply(model, tmp_path / "world.ply")
+    from plyfile import PlyData
+
+    vertex = PlyData.read(tmp_path / "world.ply")["vertex"]
+    expected = model.means.detach().double() + torch.tensor([448262.3, 5411932.7, 35.0], dtype=torch.float64)
+    for i, axis in enumerate("xyz"):
+        np.testing.assert_array_equal(vertex[axis], expected[:, i].numpy())
+    back = load_ply(tmp_path / "world.ply")
+    torch.testing.assert_close(back.means, model.means, atol=1e-6, rtol=0)  # doubles at 5e6 have steps of 1e-9
+    assert back.origin["world_origin"] == [448262.3, 5411932.7, 35.0]
+    assert torch.equal(back.quats, model.quats)
+
+
+def test_doubles_far_out_without_a_comment_are_moved_too(tmp_path):
+    model = random_model(50, 0, 0)
+    parts = file_parts(
+        *(getattr(model, name).detach().numpy() for name in ("means",)), model.sh_dc[:, 0].detach().numpy(),
+        *(getattr(model, name).detach().numpy() for name in ("sh_rest", "opacity_logits", "log_scales", "quats")),
+        add=(4e5, 5e6, 10.0),
+    )  # fmt: skip
+    (tmp_path / "m.ply").write_bytes(b"".join(parts))
+    loaded = load_ply(tmp_path / "m.ply")
+    origin = torch.tensor(loaded.origin["world_origin"]).double()
+    torch.testing.assert_close(
+        loaded.means.double() + origin,
+        model.means.double() + torch.tensor([4e5, 5e6, 10.0]).double(),
+        atol=1e-5,
+        rtol=0,
+    )
+
+
+@pytest.mark.parametrize(
+    "comment", ["world_origin 1 2", "world_origin a b c", "world_coordinates nan 0 0", "world_origin"]
+)
+def test_a_comment_that_says_no_origin_is_none(tmp_path, comment):
+    model = random_model(3, 0, 0)
+    export_ply(model, tmp_path / "m.ply")
+    raw = (tmp_path / "m.ply").read_bytes().replace(b"1.0\n", f"1.0\ncomment {comment}\n".encode(), 1)
+    (tmp_path / "m.ply").write_bytes(raw)
+    loaded = load_ply(tmp_path / "m.ply")
+    assert bits(loaded) == bits(model)
+    assert loaded.origin == {}
 
 
 def test_layout_is_the_one_that_viewers_read(tmp_path):

@@ -3,6 +3,7 @@
 import pytest
 from click.testing import CliRunner
 from hac_models import PLUGINS
+from sw_anchors.dataset_values import RANDOM_START
 from sw_datasets.families import BENCHMARKS
 from sw_datasets.rules import rules_for
 
@@ -29,12 +30,18 @@ def test_voxels_and_cells_follow_the_family(scene, voxel, factor):
 
 def test_synthetic_scenes_are_black_in_the_protocol_too():
     found = resolved("nerf_synthetic/lego")
-    assert found.scene.init_points == 10_000
+    assert found.scene.init_points == 100_000
     family = BENCHMARKS["nerf_synthetic"]
     assert "/black/" in rules_for(family, "lego", found.scene).protocol().id
     assert (
         "/white/" in rules_for(family, "lego", resolved("nerf_synthetic/lego", background="white").scene).protocol().id
     )
+
+
+@pytest.mark.parametrize("scene", ["nerf_synthetic/lego", "blender:a/folder"])
+def test_the_opacity_network_waits_where_points_are_random(scene):
+    assert resolved(scene).config.lr.mlp_opacity_early == RANDOM_START["lr.mlp_opacity_early"] < 1
+    assert resolved("tandt/truck").config.lr.mlp_opacity_early == 1
 
 
 def test_the_user_and_other_presets_come_first():

@@ -68,6 +68,14 @@ def test_the_rates_are_those_of_the_authors_schedule(stages):
     assert distill.of_step(1, 1.0)["opacity_logits"] == 0  # frozen
 
 
+def test_preset_paper_counts_as_the_authors_kernel_does_and_only_for_its_own_score(plugins):
+    config = resolve(LightGaussian, "paper", plugins=plugins).config
+    for block in (config.prune, config.score):
+        assert (block.settings["kind"], block.settings["v_pow"]) == ("v_tile_score", 0.1)
+    other = resolve(LightGaussian, "paper", sets={"prune.pruner": "opacity"}, plugins=plugins).config
+    assert (other.prune.settings, other.score.settings["kind"]) == ({}, "v_tile_score")
+
+
 def test_pruning_happens_at_the_first_step_by_the_published_share_and_may_decay(stages):
     assert stages()[0].fractions() == {1: 0.66}
     assert stages(prune__steps=[100, 1], prune__percent=0.5, prune__decay=0.6)[0].fractions() == {1: 0.5, 100: 0.3}

@@ -8,7 +8,7 @@ from sw_finetuning.pruning import lowest, removal_count
 from sw_finetuning.volume import volume_factor
 
 from splatwizard_core.gaussians.model import GaussianModel
-from sw_lightgaussian.significance import Significance
+from sw_lightgaussian.significance import Significance, tiles_under
 
 
 def alphas(camera, depth, opacity, scale):
@@ -36,6 +36,30 @@ def test_one_gaussian_catches_its_opacity_in_every_pixel_that_it_touches(rasteri
     assert float(score(rasterizer, model, [camera], kind="opacity")) == pytest.approx(0.8, rel=1e-6)
     largest = score(rasterizer, model, [camera], kind="max_v_important_score")
     assert float(largest) == pytest.approx(0.8 * hits * 0.15, rel=1e-5)
+
+
+def test_a_disc_of_pixels_touches_the_tiles_that_it_covers_wherever_it_lies():
+    # A disc of one pixel is 1.13 wide.
+    assert tiles_under(torch.tensor([0.0, 1.0])).tolist() == pytest.approx([0, 1], abs=0.02)
+    for width in (3, 20):
+        places = [len({(x + i) // 16 for i in range(width)}) for x in range(16)]
+        expected = (sum(places) / 16) ** 2
+        assert float(tiles_under(torch.tensor([math.pi / 4 * width**2]).double())) == pytest.approx(expected)
+
+
+def test_counted_by_tiles_a_wide_gaussian_is_worth_less_than_its_pixels(rasterizer, make):
+    camera = make.camera([0.0, 0.0, -4.0])
+    small, wide = (make.gaussians([[0.0, 0.0, 0.0]], [0.8], [scale]) for scale in (0.01, 0.3))
+    for model in (small, wide):
+        hits = score(rasterizer, model, [camera], kind="count")
+        tiles = score(rasterizer, model, [camera, camera], kind="v_tile_score", v_pow=0.0)
+        torch.testing.assert_close(tiles, 2 * 0.8 * tiles_under(hits), rtol=1e-5, atol=0)
+        assert float(tiles_under(hits)) < float(hits)
+    ratios = [
+        float(score(rasterizer, wide, [camera], kind=kind) / score(rasterizer, small, [camera], kind=kind))
+        for kind in ("v_important_score", "v_tile_score")
+    ]
+    assert ratios[1] < ratios[0] / 5
 
 
 def test_what_stands_behind_catches_what_is_let_through(rasterizer, make):
@@ -128,12 +152,13 @@ def test_any_method_finds_it_by_name(plugins):
 
 
 @pytest.mark.cuda
-def test_a_gpu_gives_the_scores_of_the_cpu(plugins, rasterizer, make):
+@pytest.mark.parametrize("kind", ["v_important_score", "v_tile_score"])
+def test_a_gpu_gives_the_scores_of_the_cpu(plugins, rasterizer, make, kind):
     from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 
     model = make.cloud(2000)
     cameras = [make.camera(eye, 320, 240) for eye in ([0.0, 0.0, -4.0], [3.0, 0.5, -3.0])]
-    on_cpu = score(rasterizer, model, cameras)
-    on_gpu = score(NegotiatedRasterizer(plugins, device="cuda"), model.cuda(), cameras)
+    on_cpu = score(rasterizer, model, cameras, kind=kind)
+    on_gpu = score(NegotiatedRasterizer(plugins, device="cuda"), model.cuda(), cameras, kind=kind)
     assert on_gpu.is_cuda
     assert on_gpu.cpu().tolist() == pytest.approx(on_cpu.tolist(), rel=1e-5)

@@ -21,6 +21,8 @@ MODULES = {
     "scene.dataset": "SceneOptions Dataset",
     "gaussians.splat_model": "SplatModel",
     "gaussians.model": "GaussianModel",
+    "gaussians.sound": "LeftOut leave_out_senseless",
+    "gaussians.placement": "origin_of placed_in world_shift",
     "gaussians.inputs": "GaussianInputs SH SH_C0 rgb_to_dc",
     "rendering.rasterizer": "Rasterizer RasterOptions RenderResult RasterStats AccumOutput GradBuffer ScoreSpec",
     "rendering.features": "Feature",

@@ -46,10 +46,12 @@ from splatwizard_core.plugins.registry import Entry as Entry
 from splatwizard_core.plugins.remedies import as_installed as as_installed
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer as NegotiatedRasterizer
 from splatwizard_core.runs.config import ResolvedConfig as ResolvedConfig
+from splatwizard_core.runs.config import parse_toml as parse_toml
 from splatwizard_core.runs.config import resolve as resolve
 from splatwizard_core.runs.decode import export_model as export_model
 from splatwizard_core.runs.decode import exporter_of as exporter_of
 from splatwizard_core.runs.decode import open_model as open_model
+from splatwizard_core.runs.decode import read_gaussians as read_gaussians
 from splatwizard_core.runs.device import choose_device as choose_device
 from splatwizard_core.runs.directory import OWN_FILES as OWN_FILES
 from splatwizard_core.runs.directory import RunRequest as RunRequest

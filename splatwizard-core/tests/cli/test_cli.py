@@ -334,7 +334,7 @@ def test_info_counts_the_gaussians_of_a_ply_that_are_not_finite(
     spoiled.write_bytes(head + mark + struct.pack("<f", math.nan) + body[4:])  # x of the first one
     assert main(["info", str(spoiled), "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
-    assert (facts["num_gaussians"], facts["not_finite"]) == (40, 1)
+    assert (facts["num_gaussians"], facts["not_finite"], facts["zero_rotation"]) == (39, 1, 0)
     assert all(-0.5 <= low <= high <= 0.5 for low, high in zip(facts["box"]["min"], facts["box"]["max"], strict=True))
     spoiled.write_bytes(head.replace(b"vertex 40", b"vertex 0") + mark)
     assert main(["info", str(spoiled), "--json"]) == 0

@@ -80,7 +80,7 @@ def test_a_checkpoint_without_space_ends_the_training_in_one_sentence_and_it_res
 def here(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Fresh processes are this one: starting them would be most of the time."""
 
-    def in_this_process(arguments: Sequence[str]) -> dict[str, Any]:
+    def in_this_process(arguments: Sequence[str], **_: object) -> dict[str, Any]:
         capsys.readouterr()
         assert main(arguments) == 0
         told: dict[str, Any] = json.loads(capsys.readouterr().out)

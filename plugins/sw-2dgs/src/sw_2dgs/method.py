@@ -10,7 +10,7 @@ from sw_gaussians.ply import load_ply
 from sw_gaussians.start import start_points, surfels_from_points
 from sw_gaussians.surfels import SurfelModel
 
-from splatwizard_core.api import SceneError
+from splatwizard_core.api import SceneError, placed_in
 from sw_2dgs.config import TwoDGSConfig
 from sw_2dgs.presets import PRESETS, RATES
 from sw_2dgs.stage import TwoDGSStage
@@ -38,7 +38,7 @@ class TwoDGS(GaussianMethod):
         """Surfels of the .ply that `init` names, else one for each start point of the scene. Raises SceneError."""
         config: TwoDGSConfig = self.config
         if config.init:
-            model = load_ply(config.init)
+            model = placed_in(load_ply(config.init), scene, str(config.init))
             if not isinstance(model, SurfelModel):
                 raise SceneError(
                     f"init: {config.init} holds Gaussians with three scales each: 2dgs starts from surfels, which have "

@@ -11,6 +11,7 @@ from sw_gaussians.stage import ThreeDGSStage
 from sw_gaussians.start import gaussians_from_points, start_points
 from sw_gaussians.surfels import refuse_surfels
 
+from splatwizard_core.api import placed_in
 from sw_3dgs.config import MODES, ThreeDGSConfig
 from sw_3dgs.presets import PRESETS, RATES
 
@@ -39,7 +40,7 @@ class ThreeDGS(GaussianMethod):
         """Gaussians of the .ply that `init` names, else one for each start point of the scene."""
         config: ThreeDGSConfig = self.config
         if config.init:
-            model = load_ply(config.init)
+            model = placed_in(load_ply(config.init), scene, str(config.init))
             refuse_surfels(model, f"init: {config.init}: method {self.name}")
             return model
         points = start_points(scene, "3DGS", instead="--set init=FILE.ply")

@@ -92,11 +92,14 @@ class AnchorStage(Stage):
     def learning_rates(self, step: int) -> Mapping[str, float]:
         """Learning rate of each parameter or submodule, by name: the optimizer's groups, the same at every step."""
         lr = self.opt.lr
+        # An anchor whose opacities are all negative is never drawn again. All anchors of a random start have equal
+        # features and most of them lie in empty space: at its full rate the network turns down all of them together.
+        early = lr.mlp_opacity_early if step <= self.at(lr.early_until) else 1.0
         return {
             "offsets": self.decay(step, lr.offsets_init, lr.offsets_final) * self.extent,
             "features": lr.features,
             "log_scales": lr.scales,
-            "mlp_opacity": self.decay(step, lr.mlp_opacity_init, lr.mlp_opacity_final),
+            "mlp_opacity": self.decay(step, lr.mlp_opacity_init, lr.mlp_opacity_final) * early,
             "mlp_cov": self.decay(step, lr.mlp_cov_init, lr.mlp_cov_final),
             "mlp_color": self.decay(step, lr.mlp_color_init, lr.mlp_color_final),
         }

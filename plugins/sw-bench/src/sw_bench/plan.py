@@ -5,20 +5,16 @@ from __future__ import annotations
 import difflib
 import json
 import re
-import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, StrictInt, ValidationError, field_validator
 
 from splatwizard_core.api import ConfigError
+from splatwizard_core.tooling import parse_toml
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
+MOST_SEEDS = 1000
 LABEL = re.compile(r"[\w][\w.+-]*")
 
 
@@ -92,7 +88,7 @@ class Plan(Values):
     out: str | None = None
     methods: tuple[str, ...] = Field(min_length=1)
     scenes: tuple[str, ...] = Field(min_length=1)
-    seeds: tuple[int, ...] = Field((0,), min_length=1)
+    seeds: tuple[StrictInt, ...] = Field((0,), min_length=1, max_length=MOST_SEEDS)
     device: str | None = None
     config: str | None = None
     init: str | None = None
@@ -159,10 +155,7 @@ def read_plan(path: str | Path) -> tuple[Plan, str]:
         raise ConfigError(f"cannot read the plan {path}: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path} is not valid TOML: {error}") from None
-    try:
-        content = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path} is not valid TOML: {error}") from None
+    content = parse_toml(text, path)
     return checked_plan(content, str(path)), text
 
 

@@ -76,6 +76,8 @@ class FileSettings(Params):
     pp: bool = Field(True, description="post-processing: 8-bit opacity and grid, coded indices, packed positions")
     coder: str = Field("huffman", description="entropy coder of the post-processing, by name")
     grid_threshold: float = Field(0.1, ge=0, description="post-processing makes values of the grid up to this zero")
+    grid_step: float = Field(0, ge=0, description="its 8-bit steps are no shorter; 0: its range / 255, as published")
+    grid_factor: float = Field(1.0, ge=0, description="multiplies these two: what the rate points set")
 
 
 class Codec(OwnCodec):

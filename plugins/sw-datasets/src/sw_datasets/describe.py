@@ -18,6 +18,7 @@ def describe(scene: Scene) -> dict[str, Any]:
     cameras         {"intrinsics": how many differ, "fov_x_deg": [min, max], "fov_y_deg": [min, max]}
     points          {"count", "colours": bool, "min": [3], "max": [3]} or None
     extent          world units, from the training cameras
+    origin          where the scene's origin lies in the world of its files; absent at 0
     masks, ground_truth, warnings
     """
     views = list({id(view): view for view in (*scene.train, *scene.test)}.values())
@@ -48,6 +49,7 @@ def describe(scene: Scene) -> dict[str, Any]:
             "max": points.xyz.amax(0).tolist() if len(points) else None,
         },
         "extent": scene.extent,
+        **({"origin": list(scene.origin)} if any(scene.origin) else {}),
         "masks": sum(view.load_mask is not None for view in views),
         "ground_truth": sorted(scene.ground_truth),
         "warnings": list(scene.warnings),

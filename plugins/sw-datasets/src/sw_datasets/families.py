@@ -53,6 +53,8 @@ class Family:
     views           (train, test) views of every published scene, where all have the same number
     prefix          what may stand before a scene's name in its folder's name ("scan" before DTU's "24")
     looks_for       file of a layout that only this family has, for messages
+    principal_point "center" or "file"
+    composites      pictures with alpha are composited on the background unless the user says otherwise
     signs           files and folders that lie in every scene of the family and seldom elsewhere
     """
 
@@ -70,6 +72,8 @@ class Family:
     views: tuple[int, int] | None = None
     prefix: str = ""
     looks_for: str = ""
+    principal_point: Literal["center", "file"] = "center"
+    composites: bool = True
     signs: tuple[str, ...] = ()
 
     @property
@@ -165,6 +169,7 @@ BENCHMARKS: Mapping[str, Family] = MappingProxyType(
                 split="all",
                 pictures=_both(Pictures(resolution=2)),
                 prefix="scan",
+                composites=False,  # 2DGS trains with the background: alpha is a mask for fusion and culling
             ),
         )
     }
@@ -179,6 +184,13 @@ BLENDER = Family(
     split="file",
     background="white",
     pictures=_both(Pictures(folder=None)),
+)
+TRANSFORMS = Family(
+    "transforms",
+    "transforms.json",
+    "one transforms.json with pictures and intrinsics (nerfstudio, instant-ngp, Polycam, Metashape)",
+    pictures=_both(Pictures(folder=None)),
+    principal_point="file",  # the programs that read these files use it
 )
 DEMO = Family(
     "demo",

@@ -1,22 +1,33 @@
-"""Picture files: finding them, the size at which they are used, and decoding them to uint8."""
+"""Picture files: their headers, the size at which they are used, and decoding them to uint8."""
 
 from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator, Sequence
-from pathlib import Path, PurePosixPath
+import stat
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+from PIL.TiffImagePlugin import TiffImageFile
 
 from splatwizard_core.api import ConfigError, SceneError
 
-SUFFIXES = frozenset((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"))
-
 FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP")
 """Formats that are decoded, whatever a file's suffix. Pillow knows more, and for EPS it would start Ghostscript."""
+
+UPRIGHT = 1
+TURNS = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180, 4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE, 6: Image.Transpose.ROTATE_270, 7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}  # fmt: skip
+"""EXIF orientation -> what makes the stored pixels upright; `UPRIGHT` leaves them."""
+ORIENTATION = 0x0112  # tag of EXIF
 
 PIXELS_VARIABLE = "SPLATWIZARD_MAX_PIXELS"
 MAX_PIXELS = 1 << 26
@@ -54,102 +65,53 @@ def fitted_size(width: int, height: int, resolution: int) -> tuple[int, int]:
     return max(fitted[0], 1), max(fitted[1], 1)
 
 
-def is_inside(name: str) -> bool:
-    """Whether a relative file name from a stranger's file stays inside the folder it is joined to."""
-    path = PurePosixPath(name.replace("\\", "/"))
-    return bool(path.parts) and not path.is_absolute() and ".." not in path.parts and "\0" not in name
+class Header(NamedTuple):
+    """Facts of a picture file from its header alone.
 
-
-def list_pictures(folder: Path) -> list[str]:
-    """Names of all pictures below `folder`, relative to it with forward slashes, sorted.
-
-    Links are followed, but no folder is entered twice: links in a ring would never end.
+    width, height   of the stored pixels
+    has_alpha
+    orientation     of EXIF, 1 to 8: how a viewer turns the stored pixels; 1 where the file does not say
     """
-    found = []
-    entered: set[str] = set()
-    for root, folders, files in os.walk(folder, followlinks=True):
-        real = os.path.realpath(root)
-        if real in entered:
-            folders.clear()
-            continue
-        entered.add(real)
-        folders.sort()
-        for file in files:
-            if os.path.splitext(file)[1].lower() in SUFFIXES:
-                found.append((Path(root) / file).relative_to(folder).as_posix())
-    return sorted(found)
+
+    width: int
+    height: int
+    has_alpha: bool
+    orientation: int = UPRIGHT
 
 
-def find_pictures(folder: Path, names: Sequence[str]) -> list[Path]:
-    """The file of each name: `folder/name`, or the same stem with another picture suffix.
-
-    Raises SceneError that lists the first five missing, for names that lead out of the folder, and where it is not
-    clear which file is meant: two files of one stem, or one file for two names.
-    """
-    for name in names:
-        if not is_inside(name):
-            raise SceneError(
-                f"image name {name!r} leads out of {folder}; the scene files are damaged", path=str(folder)
-            )
-    by_stem: dict[str, list[str]] | None = None
-    found: list[Path] = []
-    missing: list[str] = []
-    for name in names:
-        path = folder / name
-        if not os.path.isfile(path):  # unlike Path.is_file: False, not an error, for a name that is too long
-            if by_stem is None:
-                by_stem = {}
-                for other in list_pictures(folder):
-                    by_stem.setdefault(os.path.splitext(other)[0], []).append(other)
-            candidates = by_stem.get(os.path.splitext(name)[0], [])
-            if not candidates:
-                missing.append(name)
-                continue
-            if len(candidates) > 1:
-                raise SceneError(
-                    f"{folder}: image '{name}' is not there, and {' and '.join(candidates[:3])} could both stand for "
-                    "it; keep one",
-                    path=str(folder),
-                )
-            path = folder / candidates[0]
-        found.append(path)
-    if missing:
-        first = ", ".join(repr(name) for name in missing[:5]) + (", ..." if len(missing) > 5 else "")
-        raise SceneError(f"{folder}: {len(missing)} of {len(names)} images are missing: {first}", path=str(folder))
-    served: dict[Path, str] = {}
-    for name, path in zip(names, found, strict=True):
-        if served.setdefault(path, name) != name:
-            raise SceneError(
-                f"{folder}: {path.name} is the only file for two images, '{served[path]}' and '{name}'",
-                path=str(folder),
-            )
-    return found
+def read_header(path: Path) -> Header:
+    """Facts of a picture file; no pixel is decoded. Raises SceneError if it is no picture."""
+    with _opened(path, "not a readable picture") as picture:
+        return Header(picture.width, picture.height, _has_alpha(picture), _orientation(picture))
 
 
 def picture_header(path: Path) -> tuple[int, int, bool]:
     """(width, height, has alpha) of a picture file, from its header alone. Raises SceneError if it is no picture."""
-    with _opened(path, "not a readable picture") as picture:
-        return picture.width, picture.height, _has_alpha(picture)
+    return read_header(path)[:3]
 
 
-def load_picture(path: Path, size: tuple[int, int] | None = None, *, alpha: bool = True) -> NDArray[np.uint8]:
+def load_picture(
+    path: Path, size: tuple[int, int] | None = None, *, alpha: bool = True, turn: int = UPRIGHT
+) -> NDArray[np.uint8]:
     """uint8 [H,W,3], or [H,W,4] with straight alpha if the file has it and `alpha` is True.
 
     size    (width, height) to resize to, Pillow's bicubic in 8 bit (premultiplied where there is alpha)
+    turn    EXIF orientation by which the stored pixels are turned; what the file itself says is not looked at
 
-    Grey, palette, CMYK and 16-bit pictures are converted; EXIF rotation is ignored, as COLMAP does.
-    Raises SceneError if the file cannot be decoded.
+    Grey, palette, CMYK and 16-bit pictures are converted. Raises SceneError if the file cannot be decoded.
     """
     with _opened(path, "the picture cannot be decoded") as opened:
         picture = _to_8bit(opened, keep_alpha=alpha)
+    if turn in TURNS:
+        picture = picture.transpose(TURNS[turn])
     if size is not None and picture.size != size:
         picture = picture.resize(size, Image.Resampling.BICUBIC)
     return np.asarray(picture)
 
 
-def load_composited(path: Path, size: tuple[int, int], background: int) -> NDArray[np.uint8]:
+def load_composited(path: Path, size: tuple[int, int], background: int, *, turn: int = UPRIGHT) -> NDArray[np.uint8]:
     """uint8 [H,W,3]: the picture on a grey of `background` (0..255), truncated to 8 bit and then resized to `size`."""
-    pixels = load_picture(path)
+    pixels = load_picture(path, turn=turn)
     if pixels.shape[2] == 4:
         share = pixels / 255.0
         mixed = share[..., :3] * share[..., 3:] + background / 255.0 * (1 - share[..., 3:])
@@ -158,18 +120,24 @@ def load_composited(path: Path, size: tuple[int, int], background: int) -> NDArr
     return np.asarray(picture if picture.size == size else picture.resize(size, Image.Resampling.BICUBIC))
 
 
-def load_cut_out(path: Path, mask: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
+def load_cut_out(
+    path: Path, mask: Path, size: tuple[int, int], *, turn: int = UPRIGHT, mask_turn: int = UPRIGHT
+) -> NDArray[np.uint8]:
     """uint8 [H,W,4]: a picture without alpha at `size` = (width, height), opaque where its mask file is set."""
-    return np.dstack([load_picture(path, size, alpha=False), 255 * load_mask(mask, size).astype(np.uint8)])
+    opaque = load_mask(mask, size, turn=mask_turn)
+    return np.dstack([load_picture(path, size, alpha=False, turn=turn), 255 * opaque.astype(np.uint8)])
 
 
-def load_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
+def load_mask(path: Path, size: tuple[int, int], *, turn: int = UPRIGHT) -> NDArray[np.bool_]:
     """bool [H,W]: True where the mask picture is at least half bright, or half opaque if it has alpha.
 
     size    (width, height) to resize to, nearest neighbour
+    turn    as in `load_picture`
     """
     with _opened(path, "the mask cannot be decoded") as opened:
         grey = opened.convert("RGBA").getchannel("A") if _has_alpha(opened) else _to_8bit(opened).convert("L")
+    if turn in TURNS:
+        grey = grey.transpose(TURNS[turn])
     if grey.size != size:
         grey = grey.resize(size, Image.Resampling.NEAREST)
     return np.asarray(grey) >= 128
@@ -179,6 +147,8 @@ def load_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
 def _opened(path: Path, complaint: str) -> Iterator[Image.Image]:
     """Open a picture file; whatever Pillow raises in the block becomes a SceneError."""
     try:
+        if not stat.S_ISREG(os.stat(path).st_mode):  # opening a pipe waits for a writer
+            raise SceneError(f"{path}: {complaint} (it is no file but a folder, a pipe or a device)", path=str(path))
         with Image.open(path, formats=FORMATS) as picture:
             limit = pixel_limit()
             if picture.width * picture.height > limit:
@@ -190,6 +160,24 @@ def _opened(path: Path, complaint: str) -> Iterator[Image.Image]:
             yield picture
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise SceneError(f"{path}: {complaint} ({error})", path=str(path)) from error
+
+
+def _orientation(picture: Image.Image) -> int:
+    """EXIF orientation, where it stands ahead of the pixels: asking Pillow for all of EXIF would decode a PNG.
+
+    That of a TIFF is applied by Pillow itself, to its size and to its pixels.
+    """
+    if isinstance(picture, TiffImageFile):
+        return UPRIGHT
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # "Corrupt EXIF data": then the file does not say
+            exif = Image.Exif()
+            exif.load(picture.info.get("exif", b""))
+            said = exif.get(ORIENTATION, UPRIGHT)
+        return said if type(said) is int and said in TURNS else UPRIGHT
+    except Exception:  # Pillow raises many kinds for damaged EXIF, which is no reason to refuse the picture
+        return UPRIGHT
 
 
 def _has_alpha(picture: Image.Image) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from splatwizard_core.api import Registry, hookimpl
-from sw_datasets.families import BENCHMARKS, BLENDER, COLMAP, DEMO
+from sw_datasets.families import BENCHMARKS, BLENDER, COLMAP, DEMO, TRANSFORMS
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Scene
@@ -23,6 +23,9 @@ def register_datasets(registry: Registry) -> None:
     registry.add(BLENDER.name, f"{LOADERS}.blender:BlenderDataset",
                  looks_for="transforms_train.json (Blender)",
                  summary=BLENDER.summary)  # fmt: skip
+    registry.add(TRANSFORMS.name, f"{LOADERS}.transforms:TransformsDataset",
+                 looks_for="transforms.json (nerfstudio, instant-ngp, Polycam)",
+                 summary=TRANSFORMS.summary)  # fmt: skip
     registry.add(DEMO.name, "sw_datasets.demo.dataset:DemoDataset", default=True, procedural=True,
                  summary=DEMO.summary)  # fmt: skip
     for family in BENCHMARKS.values():

@@ -19,6 +19,8 @@ class Rules:
     scene       its published scene, None for any other folder
     asked       named protocol whose pictures are the default
     images      picture folder; None: the layout has none to choose
+    masked      pictures are cut out by alpha or mask; None: by alpha, if the family composites it
+    finds_lists lists of names in the scene decide its split, as the user named none and nothing is published
     the rest    as in Protocol
     """
 
@@ -30,16 +32,22 @@ class Rules:
     split: str
     background: str
     principal_point: str
-    masked: bool
+    masked: bool | None
     composite8: bool
+    finds_lists: bool = False
+
+    @property
+    def cuts_alpha(self) -> bool:
+        """Whether pictures with alpha are composited on the background."""
+        return self.family.composites if self.masked is None else self.masked
 
     @property
     def name(self) -> str:
         """The named protocol that these very rules are, else "custom"."""
         if self.scene is None:
             return "custom"
-        plain = (self.family.split, self.family.background, "center", False, False)
-        if (self.split, self.background, self.principal_point, self.masked, self.composite8) != plain:
+        plain = (self.family.split, self.family.background, self.family.principal_point, False)
+        if (self.split, self.background, self.principal_point, self.composite8) != plain:
             return "custom"
         for name in (self.asked, *PROTOCOLS):
             pictures = self.family.pictures[name]
@@ -47,10 +55,11 @@ class Rules:
                 return name
         return "custom"
 
-    def protocol(self, label: str | None = None) -> Protocol:
+    def protocol(self, label: str | None = None, *, masked: bool = False) -> Protocol:
         """The protocol that the record keeps.
 
         label   stands for the picture folder where the layout has none
+        masked  pictures were cut out by alpha or mask, beyond what the layout always does
         """
         return Protocol(
             self.family.name,
@@ -59,9 +68,9 @@ class Rules:
             split=self.split,
             background=self.background,
             principal_point=self.principal_point,
-            masked=self.masked,
+            masked=masked,
             composite8=self.composite8,
-            name=self.name,
+            name=self.name if not masked else "custom",
         )
 
 
@@ -103,20 +112,11 @@ def rules_for(family: Family, folder: str, options: SceneOptions) -> Rules:
         pictures.resolution if options.resolution is None else options.resolution,
         split,
         options.background or family.background,
-        options.principal_point,
+        options.principal_point or family.principal_point,
         options.mask_background,
         options.legacy_8bit_composite,
+        finds_lists=options.split is None and options.test_every is None and not family.scenes,
     )
-
-
-def off_centre_warnings(pixels: float, rules: Rules) -> list[str]:
-    """Warn where principal points lie more than 1 px, at the most `pixels`, off the middle that is taken for them."""
-    if pixels <= 1 or rules.principal_point == "file":
-        return []
-    return [
-        f"the principal point is up to {pixels:.1f} px off the image centre and is taken as the centre, "
-        "as the 3DGS code does (principal_point = file uses it)"
-    ]
 
 
 def unused_option_warnings(options: SceneOptions, keys: Iterable[str], family: Family) -> list[str]:

@@ -10,7 +10,16 @@ from splatwizard_core.api import SceneError
 
 T = TypeVar("T")
 
-RULES = "'every<n>' (every n-th is a test view), 'lod:<k>', 'all', or 'file' where the scene brings its own"
+RULES = (
+    "'every<n>' (every n-th is a test view), 'lod:<k>', 'all', 'file' where the scene brings its own, "
+    "or a file of names"
+)
+RULE = re.compile(r"(every|lod:)(\d{1,9})")
+
+
+def is_rule(split: str) -> bool:
+    """Whether a split is one of the rules, and no file of names."""
+    return split in ("all", "file") or RULE.fullmatch(split) is not None
 
 
 def split_views(views: Sequence[T], rule: str) -> tuple[list[T], list[T]]:
@@ -28,7 +37,7 @@ def split_views(views: Sequence[T], rule: str) -> tuple[list[T], list[T]]:
         if not views:
             raise SceneError("split 'all' needs at least 1 view, got 0")
         return views, list(views)
-    match = re.fullmatch(r"(every|lod:)(\d{1,9})", rule)
+    match = RULE.fullmatch(rule)
     if match is None:
         raise SceneError(f"unknown split '{rule}': use {RULES}")
     n = int(match[2])

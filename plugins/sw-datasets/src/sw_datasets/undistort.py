@@ -22,7 +22,8 @@ from splatwizard_core.api import CapabilityError, SceneError, track
 from splatwizard_core.tooling import new_folder
 from sw_datasets.loaders.colmap import MAX_SIDE, PLAIN_FOCALS, RADIAL_FOCALS, mask_files, model_folder
 from sw_datasets.loaders.colmap_model import ColmapCamera, ColmapImage, ColmapModel, read_model, write_model
-from sw_datasets.pictures import FORMATS, find_pictures, load_mask, load_picture, picture_header
+from sw_datasets.picture_names import find_pictures
+from sw_datasets.pictures import FORMATS, load_mask, load_picture, picture_header
 
 SMALLEST_SHARE = 0.5
 """Of the undistorted picture that must survive when black corners are cut off; less means broken coefficients."""

@@ -10,7 +10,8 @@ from typing import Any
 
 from splatwizard_core.api import PluginManager, Scene, SceneError, SceneOptions, SplatwizardError, View, track
 from splatwizard_core.tooling import file_sha256, load_scene
-from sw_datasets.pictures import find_pictures, is_inside, picture_header
+from sw_datasets.picture_names import find_pictures, is_inside
+from sw_datasets.pictures import picture_header
 
 MAX_PROBLEMS = 5
 """Of one kind; more are counted."""

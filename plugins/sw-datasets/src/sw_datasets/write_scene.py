@@ -21,7 +21,7 @@ from sw_datasets.loaders.colmap_model import (
     ColmapPoints,
     write_model,
 )
-from sw_datasets.pictures import is_inside
+from sw_datasets.picture_names import is_inside
 
 FORMATS = ("colmap", "blender")
 

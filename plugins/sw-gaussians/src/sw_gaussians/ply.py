@@ -12,17 +12,27 @@ from pathlib import Path
 
 import torch
 
-from splatwizard_core.api import GaussianModel, SceneError, SplatModel, replacing
+from splatwizard_core.api import (
+    GaussianModel,
+    SceneError,
+    SplatModel,
+    leave_out_senseless,
+    origin_of,
+    replacing,
+    world_shift,
+)
 from sw_gaussians.drawn_as import antialias_of, lost_options
 from sw_gaussians.mapped import mapped
-from sw_gaussians.ply_gaussians import MIP_COMMENT, file_parts, parse_gaussians
+from sw_gaussians.ply_gaussians import MIP_COMMENT, ORIGIN_COMMENT, WORLD_COMMENT, file_parts, parse_gaussians
 from sw_gaussians.surfels import as_ellipsoids, gaussians_of
 
 log = logging.getLogger(__name__)
 
 
 def load_ply(path: str | os.PathLike[str]) -> GaussianModel:
-    """Read a model with exactly the values of the file, active SH degree = the degree that is stored (0 .. 3).
+    """Read a model with the values of the file, active SH degree = the degree that is stored (0 .. 3).
+
+    Rows that mean nothing (a value that is no number, a rotation of zero) are left out, and counted in the log.
 
     A file with scale_0 and scale_1 and no scale_2 holds surfels: a SurfelModel. One whose comments say that it was
     trained with antialiasing asks for that in the model's `origin`.
@@ -51,15 +61,17 @@ def from_ply(data: bytes | memoryview, path: str) -> GaussianModel:
     model = gaussians_of(*(torch.from_numpy(column) for column in columns))
     if found.antialiased:
         model.origin = {"antialiased": True, "raster": {"antialias": True}}
-    return model
+    if found.world_origin is not None:
+        model.origin = {**model.origin, "world_origin": list(found.world_origin)}
+    return leave_out_senseless(model, Path(path).name)
 
 
 def export_ply(model: SplatModel, path: str | os.PathLike[str]) -> None:
     """Write the raw parameters, binary little-endian, normals zero; `load_ply` gives every bit back.
 
-    A comment says that the model asks for antialiasing, if it does; the log tells what no .ply can say. The file is
-    complete or absent: it is written beside `path` and then renamed. Raises SceneError for models that are not explicit
-    Gaussians.
+    Comments say that the model asks for antialiasing, and where its origin lies in the world; the log tells what no
+    .ply can say. The file is complete or absent: it is written beside `path` and then renamed. Raises SceneError for
+    models that are not explicit Gaussians.
     """
     if not isinstance(model, GaussianModel):
         raise SceneError(
@@ -70,8 +82,12 @@ def export_ply(model: SplatModel, path: str | os.PathLike[str]) -> None:
     for what in lost_options(model):
         log.warning("%s: not kept: %s", Path(path).name, what)
     comments = [MIP_COMMENT] if antialias_of(model) else []
+    shift = world_shift(model)
+    if (origin := origin_of(model)) is not None and any(origin):
+        word = ORIGIN_COMMENT if shift is None else WORLD_COMMENT
+        comments.append(f"{word} {' '.join(map(repr, origin))}")
     with replacing(path) as temporary, open(temporary, "wb") as file:
-        file.writelines(_parts_of(model, comments))
+        file.writelines(_parts_of(model, comments, shift))
 
 
 def export_ply_as_3dgs(model: SplatModel, path: str | os.PathLike[str]) -> None:
@@ -87,6 +103,8 @@ def to_ply(model: GaussianModel) -> bytes:
     return b"".join(_parts_of(model))
 
 
-def _parts_of(model: GaussianModel, comments: Sequence[str] = ()) -> Iterator[bytes | memoryview]:
+def _parts_of(
+    model: GaussianModel, comments: Sequence[str] = (), add: Sequence[float] | None = None
+) -> Iterator[bytes | memoryview]:
     columns = (model.means, model.sh_dc[:, 0], model.sh_rest, model.opacity_logits, model.log_scales, model.quats)
-    return file_parts(*(column.detach().cpu().float().numpy() for column in columns), comments=comments)
+    return file_parts(*(column.detach().cpu().float().numpy() for column in columns), comments=comments, add=add)

@@ -23,6 +23,11 @@ Array = npt.NDArray[np.float32]
 
 MIP_COMMENT = "SplatRenderMode: mip"
 """Says that a file was trained with the filter of Mip-Splatting."""
+ORIGIN_COMMENT, WORLD_COMMENT = "world_origin", "world_coordinates"
+"""Words of comments with three numbers: where the origin of the coordinates lies in the world of the scene; of the
+second the coordinates are those of the world, and the numbers say about which origin they can be held in float32."""
+FAR_OUT = 1e4
+"""Distance from 0, in sizes of the model, from which coordinates in doubles are kept about an origin of their own."""
 _ROWS_AT_ONCE = 1 << 13  # 2 MB of rows: they stay in the processor's cache
 
 
@@ -39,6 +44,7 @@ class PlyGaussians:
     antialiased     the file says that it was trained with the filter of Mip-Splatting
     ignored         properties that mean nothing to a Gaussian
     notes           what else a reader should tell
+    world_origin    where the origin of `means` lies in the world; None: the file does not say
     """
 
     means: Array
@@ -51,6 +57,7 @@ class PlyGaussians:
     comments: tuple[str, ...]
     ignored: tuple[str, ...]
     notes: tuple[str, ...]
+    world_origin: tuple[float, float, float] | None = None
 
 
 def property_names(sh_rest: int, scales: int = 3) -> list[str]:
@@ -101,8 +108,9 @@ def parse_gaussians(data: bytes | memoryview, path: str, *, max_gaussians: int |
         )
     if spare := header.spare_bytes(len(data)):
         notes.append(f"{spare:,} bytes after its last row mean nothing")
+    means, world_origin = _means(vertex, header.comments, notes)
     return PlyGaussians(
-        _contiguous(_columns(vertex, ["x", "y", "z"])),
+        means,
         _colours(vertex),
         _contiguous(channels.transpose(0, 2, 1)),
         opacity_logits,
@@ -112,7 +120,38 @@ def parse_gaussians(data: bytes | memoryview, path: str, *, max_gaussians: int |
         header.comments,
         tuple(n for n in vertex.dtype.names or () if n not in known),
         tuple(notes),
+        world_origin,
     )
+
+
+def _means(vertex: Table, comments: Sequence[str], notes: list[str]) -> tuple[Array, tuple[float, float, float] | None]:
+    """(means [N,3], world origin): coordinates of the world are moved to a local origin in double precision."""
+    told = {word: _three_numbers(comments, word) for word in (ORIGIN_COMMENT, WORLD_COMMENT)}
+    origin = told[WORLD_COMMENT]
+    doubles = [vertex.dtype[axis] for axis in "xyz"] == [np.dtype("f8")] * 3
+    if origin is None and told[ORIGIN_COMMENT] is None and doubles and len(vertex):
+        middle = [float(np.median(vertex[axis])) for axis in "xyz"]
+        size = max(float(np.median(np.abs(vertex[axis] - at))) for axis, at in zip("xyz", middle, strict=True))
+        if math.isfinite(sum(middle)) and math.hypot(*middle) > FAR_OUT * max(size, 1e-9):
+            origin = (round(middle[0]), round(middle[1]), round(middle[2]))
+            notes.append(f"its coordinates lie far from 0 and are moved to a local origin at {origin}")
+    if origin is None:
+        return _contiguous(_columns(vertex, ["x", "y", "z"])), told[ORIGIN_COMMENT]
+    columns = [vertex[axis].astype(np.float64) - at for axis, at in zip("xyz", origin, strict=True)]
+    with np.errstate(all="ignore"):
+        return np.stack(columns, axis=1).astype(np.float32), origin
+
+
+def _three_numbers(comments: Sequence[str], word: str) -> tuple[float, float, float] | None:
+    for comment in comments:
+        name, *rest = comment.split()[:5] or [""]
+        if name == word and len(rest) == 3:
+            try:
+                x, y, z = map(float, rest)
+            except ValueError:
+                return None
+            return (x, y, z) if math.isfinite(x + y + z) else None
+    return None
 
 
 def _check_dialect(header: PlyHeader, name: str, path: str) -> tuple[int, bool]:
@@ -221,11 +260,16 @@ def file_parts(
     log_scales: Array,
     quats: Array,
     comments: Sequence[str] = (),
+    add: Sequence[float] | None = None,
 ) -> Iterator[bytes | memoryview]:
-    """Yield the header, then rows little-endian, normals zero, columns as `property_names` (shapes: PlyGaussians)."""
+    """Yield the header, then rows little-endian, normals zero, columns as `property_names` (shapes: PlyGaussians).
+
+    add     to the coordinates, which become doubles then
+    """
     names = property_names(sh_rest.shape[1], log_scales.shape[1])
     told = "".join(f"comment {comment}\n" for comment in comments)
-    properties = "".join(f"property float {name}\n" for name in names)
+    wide = "xyz" if add is not None else ""
+    properties = "".join(f"property {'double' if name in wide else 'float'} {name}\n" for name in names)
     start = f"ply\nformat binary_little_endian 1.0\n{told}element vertex {len(means)}\n{properties}end_header\n"
     yield start.encode("ascii", "replace")
     rest = 9 + 3 * sh_rest.shape[1]
@@ -235,4 +279,9 @@ def file_parts(
         rows[:, :3], rows[:, 6:9], rows[:, rest] = means[part], sh_dc[part], opacity_logits[part]
         rows[:, 9:rest] = sh_rest[part].transpose(0, 2, 1).reshape(len(rows), -1)
         rows[:, rest + 1 : -4], rows[:, -4:] = log_scales[part], quats[part]
-        yield rows.data
+        if add is None:
+            yield rows.data
+            continue
+        doubles = np.empty(len(rows), [("means", "<f8", 3), ("others", "<f4", len(names) - 3)])
+        doubles["means"], doubles["others"] = means[part].astype(np.float64) + np.array(add), rows[:, 3:]
+        yield doubles.tobytes()

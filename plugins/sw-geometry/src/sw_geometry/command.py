@@ -132,6 +132,7 @@ def mesh(
     scores, culled = _measured(subject, parameters, settings, built, units=units, asked=chamfer)
     facts = {
         **built.facts, "model": path.name, "sha256": file_sha256(path), "scene": loaded.name,
+        "world_origin": list(loaded.origin),
         "rasterizers": dict(subject.rasterizer.choices), **({"chamfer": scores} if scores else {}),
     }  # fmt: skip
     alone = target.suffix.lower() == MESH and not target.is_dir()
@@ -145,6 +146,8 @@ def mesh(
         f"mesh: {len(built.post.vertices):,} vertices, {len(built.post):,} triangles, "
         f"voxel {parameters.voxel_size:.4g}, {built.facts['seconds']:.1f} s: {target if alone else target / POST}"
     )
+    if any(loaded.origin):
+        click.echo(f"its coordinates are those about the scene's local origin, which lies at {loaded.origin}")
     for name, value in scores.items():
         click.echo(f"{name}: {value:.4g}" if isinstance(value, float) else f"{name}: {value}")
 

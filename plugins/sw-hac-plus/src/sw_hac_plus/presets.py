@@ -13,7 +13,9 @@ _OWN: Mapping[str, Mapping[str, Any]] = {
     "nerf_synthetic": {"lr.masks_by_rate": 0.08, "channel.kind": "tiny"},
 }
 
-BY_DATASET: Mapping[str, Mapping[str, Any]] = {name: {**values, **_OWN[name]} for name, values in HAC_VALUES.items()}
+BY_DATASET: Mapping[str, Mapping[str, Any]] = {
+    name: {**values, **_OWN.get(name, {})} for name, values in HAC_VALUES.items()
+}
 
 PRESETS: Mapping[str, Mapping[str, Any]] = {
     "paper": {},

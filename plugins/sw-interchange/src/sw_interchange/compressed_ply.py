@@ -137,11 +137,12 @@ def write_compressed_ply(scene: GaussianScene, options: Options, report: WriteRe
     values = [scene.means, np.clip(scene.log_scales, -LARGEST_SCALE, LARGEST_SCALE)]
     values.append((0.5 + np.float32(SH_C0) * scene.sh_dc).astype(np.float32))
     bounds, shares = [], []
-    for each in values:
+    for kind, each in zip(("means", "log_scales", "colours"), values, strict=True):
         low, high = np.minimum.reduceat(each, starts), np.maximum.reduceat(each, starts)
         span = high - low
         wide = np.where(span < 1e-5, np.float32(np.inf), span)
         bounds += [low, high]
+        _tell_loss(kind, span, chunk, scene, report)
         shares.append(np.clip((each - low[chunk]) / wide[chunk], 0, 1))
     alphas = sigmoid(scene.opacity_logits)
     vertex = np.stack(
@@ -158,6 +159,25 @@ def write_compressed_ply(scene: GaussianScene, options: Options, report: WriteRe
         codes = np.clip(np.trunc(256 * (scene.sh_rest / 8 + np.float32(0.5))), 0, 255).astype(np.uint8)
         parts.append(codes.transpose(0, 2, 1).tobytes())
     return [(header + "end_header\n").encode("ascii"), *parts]
+
+
+def _tell_loss(kind: str, span: Array, chunk: npt.NDArray[np.int64], scene: GaussianScene, report: WriteReport) -> None:
+    """Warn where one outlier of a chunk of 256 makes the steps of all others coarse.
+
+    span    [chunks,3] greatest minus least value
+    """
+    levels = np.array([(1 << (8 if kind == "colours" else bits)) - 1 for bits in WIDTHS], np.float64)
+    steps = span / levels
+    if kind == "means":
+        report.coarse(steps[chunk], scene.means, scene.log_scales)
+        return
+    name, limit = ("scales", 0.1) if kind == "log_scales" else ("colours", 0.05)
+    coarse = (steps.max(axis=1) / 2 > limit)[chunk]
+    if coarse.any():
+        report.warnings.append(
+            f"{name} of {int(coarse.sum()):,} of {len(chunk):,} Gaussians lose up to "
+            f"{steps.max() / 2:.2g}: outliers widen the range of their chunks of {CHUNK}"
+        )
 
 
 def _unorm(share: Array, bits: int) -> Words:

@@ -6,13 +6,14 @@ import io
 import json
 import os
 import zipfile
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from splatwizard_core.api import BitstreamError, SceneError, UserInputError, replacing
+from splatwizard_core.api import BitstreamError, LeftOut, SceneError, UserInputError, replacing
 from sw_interchange.frames import axes_of, in_frame
 from sw_interchange.known_formats import Format, detect, format_named, format_of_suffix
 from sw_interchange.scene import GaussianScene, Limits, ReadReport, WriteReport, cleaned
@@ -74,17 +75,25 @@ def decode(
 
 
 def write(
-    scene: GaussianScene, path: str | os.PathLike[str], *, format: str | None = None, **options: Any
+    scene: GaussianScene,
+    path: str | os.PathLike[str],
+    *,
+    format: str | None = None,
+    before: Callable[[WriteReport], None] | None = None,
+    **options: Any,
 ) -> WriteReport:
     """Write a file, complete or absent, in the axes of its format; the report says what it could not hold.
 
     format      None: by the suffix of `path`
+    before      gets the report before anything is written
     options     of the format, see docs/formats.md
 
     Raises UserInputError for unknown formats and options, and for scenes that the format cannot hold at all.
     """
     chosen = format_of_suffix(path) if format is None else format_named(format)
     parts, report = _encoded(scene, chosen, options)
+    if before is not None:
+        before(report)
     if chosen.name == FOLDER:
         _unpack(parts[0], Path(path))
         return report
@@ -168,9 +177,9 @@ def _encoded(scene: GaussianScene, chosen: Format, values: dict[str, Any]) -> tu
 
 def _sound(scene: GaussianScene, report: WriteReport) -> GaussianScene:
     """The scene without rows that are no numbers, which codes of integers cannot hold."""
-    kept = cleaned(scene, ReadReport("scene"), strict=False, name="the scene")
-    if kept.num_gaussians < scene.num_gaussians:
-        left = scene.num_gaussians - kept.num_gaussians
-        report.warnings.append(f"{left:,} Gaussians hold values that are no numbers, and were left out")
+    found = ReadReport("scene")
+    kept = cleaned(scene, found, strict=False, name="the scene")
+    if found.dropped:
+        report.warnings.append(str(LeftOut(**found.left_out)))
         report.num_gaussians = kept.num_gaussians
     return kept

@@ -5,14 +5,16 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 from sw_gaussians.drawn_as import lost_options
 
-from splatwizard_core.api import GaussianModel, SceneError, SplatModel
+from splatwizard_core.api import GaussianModel, LeftOut, SceneError, SplatModel, origin_of, world_shift
 from sw_interchange.bridge import from_gaussians, to_gaussians
 from sw_interchange.files import read, write
-from sw_interchange.scene import ReadReport
+from sw_interchange.scene import ReadReport, WriteReport
 
 log = logging.getLogger(__name__)
 
@@ -29,7 +31,9 @@ def _importer(name: str) -> Callable[[Path], GaussianModel]:
         for line in notices(scene.report):
             log.warning("%s: %s", os.path.basename(path), line)
         told = {key: value for key, value in scene.report.as_dict().items() if key not in ("bytes", "num_gaussians")}
-        model.origin = {**told, "antialiased": scene.antialiased, **model.origin}
+        left = {"left_out": told.pop("left_out")} if scene.report.dropped else {}
+        told.pop("left_out", None)
+        model.origin = {**told, "antialiased": scene.antialiased, **left, **model.origin}
         return model
 
     return load
@@ -42,10 +46,21 @@ def _exporter(name: str, **options: Any) -> Callable[[SplatModel, Path], None]:
                 f"a {type(model).__name__} cannot be written as {name}: its Gaussians depend on the camera",
                 path=str(path),
             )
-        report = write(from_gaussians(model), path, format=name, **options)
-        lost = [f"not kept: {what}" for what in [*report.lost, *lost_options(model)]]
-        for line in [*lost, *report.notices()]:
-            log.warning("%s: %s", os.path.basename(path), line)
+        found, told = from_gaussians(model), os.path.basename(path)
+        origin, shift = origin_of(model), world_shift(model)
+        if shift is not None:
+            found = replace(found, means=(found.means.astype(np.float64) + np.array(shift)).astype(np.float32))
+            step = np.spacing(np.float32(np.abs(shift).max()))
+            log.warning("%s: coordinates of the world have steps of %.2g in float32; a .ply holds doubles", told, step)
+        elif origin is not None and any(origin):
+            log.warning("%s: not kept: where its origin lies in the world (%s)", told, ", ".join(map(str, origin)))
+
+        def tell(report: WriteReport) -> None:
+            lost = [f"not kept: {what}" for what in [*report.lost, *lost_options(model)]]
+            for line in [*lost, *report.notices()]:
+                log.warning("%s: %s", told, line)
+
+        write(found, path, format=name, before=tell, **options)
 
     return save
 
@@ -54,7 +69,7 @@ def notices(report: ReadReport) -> list[str]:
     """Lines that a user should see of what a reader found."""
     found = list(report.warnings)
     if report.dropped:
-        found.append(f"{report.dropped:,} Gaussians hold values that are no numbers, and were left out")
+        found.append(str(LeftOut(**report.left_out)))
     return found
 
 

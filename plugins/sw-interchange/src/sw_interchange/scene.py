@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from splatwizard_core.api import BitstreamError, UserInputError
+from splatwizard_core.api import BitstreamError, LeftOut, UserInputError
 from sw_interchange.bands import COEFFICIENTS, Array
 from sw_interchange.frames import in_frame
 
@@ -19,6 +19,10 @@ FLAT = -20.0
 LARGEST_LOGIT = 13.815510
 """Logit of an opacity of 1 - 1e-6: beyond it float32 knows no difference."""
 
+NO_MORE_SEEN = 2e-4
+"""Share of the scene's extent below which a displacement is seen in no picture."""
+SHORTEST_QUAT = 1e-12
+"""Norm below which a quaternion has no direction."""
 SMALLEST_SCALE, LARGEST_SCALE = np.float32(-87.33), np.float32(88.72)
 """Log scales whose exponentials are normal numbers of float32."""
 
@@ -29,13 +33,25 @@ class Limits:
 
     max_gaussians       rows
     max_output_bytes    of all that is decompressed from it
+    free_gaussians      rows that any file may claim
+    gaussians_per_byte  of the file: as many more it may claim. Real scenes take 5 bytes a Gaussian at the least; a
+                        thousand bytes of one-coloured images or zeros claim as many millions as they like
     """
 
     max_gaussians: int = 1 << 27
     max_output_bytes: int = 16 << 30
+    free_gaussians: int = 1 << 20
+    gaussians_per_byte: int = 4
 
-    def check(self, count: int, decoded_bytes: int, name: str) -> None:
-        """Raise BitstreamError if a file claims more."""
+    def check(self, count: int, decoded_bytes: int, name: str, held_bytes: int | None = None) -> None:
+        """Raise BitstreamError if a file claims more.
+
+        held_bytes  of all files of the scene as they lie on the disk; None: every row lies there as it is
+        """
+        if held_bytes is not None and count > self.free_gaussians + self.gaussians_per_byte * held_bytes:
+            raise BitstreamError(
+                f"{name}: claims {count:,} Gaussians in {held_bytes:,} bytes: no scene is packed so tightly"
+            )
         if count > self.max_gaussians:
             raise BitstreamError(f"{name}: claims {count:,} Gaussians, more than the limit of {self.max_gaussians:,}")
         if decoded_bytes > self.max_output_bytes:
@@ -48,7 +64,8 @@ class ReadReport:
 
     stored_frame    directions of +X, +Y, +Z in the file, as far as that is known
     repairs         kind of repair -> values
-    dropped         rows that held what is no number
+    dropped         rows that mean nothing
+    left_out        of these, how many hold a value that is no number, and how many a rotation of zero
     ignored         parts of the file that mean nothing to a Gaussian
     """
 
@@ -60,6 +77,7 @@ class ReadReport:
     bytes: int = 0
     repairs: dict[str, int] = field(default_factory=dict)
     dropped: int = 0
+    left_out: dict[str, int] = field(default_factory=dict)
     ignored: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
@@ -98,6 +116,27 @@ class WriteReport:
         """Lines that a user should see: warnings, and what was clamped."""
         clamped = [f"{count:,} values of {field} lie beyond its range" for field, count in self.clamped.items()]
         return self.warnings + clamped
+
+    def coarse(self, steps: Array, means: Array, log_scales: Array) -> None:
+        """Warn of Gaussians whose positions are rounded so coarsely that the picture changes.
+
+        steps   [N], [N,3] or one number: distance of neighbouring codes of a coordinate, units of the scene
+
+        A position may be off by half a step: that is told where it is more than the Gaussian's own size, and more than
+        a five-thousandth of the scene.
+        """
+        off = np.broadcast_to(np.asarray(steps, np.float64) / 2, means.shape if np.ndim(steps) != 1 else (len(means),))
+        off = off if off.ndim == 1 else off.max(axis=1)
+        with np.errstate(over="ignore"):
+            size = np.exp(log_scales.max(axis=1).astype(np.float64))
+        extent = float(np.median(np.abs(means - np.median(means, axis=0))))
+        lost = (off > size) & (off > NO_MORE_SEEN * extent)
+        if lost.any():
+            self.warnings.append(
+                f"coordinates of {int(lost.sum()):,} of {len(means):,} Gaussians lose up to {off[lost].max():.3g} "
+                "units, more than their own size: the format's precision follows the farthest Gaussian; remove what "
+                "lies far out"
+            )
 
     def count(self, name: str, mask: npt.NDArray[np.bool_]) -> None:
         """Count the values of a field that are clamped, if there are any."""
@@ -189,7 +228,9 @@ def logit_of_byte(codes: npt.NDArray[np.uint8]) -> Array:
 
 
 def cleaned(scene: GaussianScene, report: ReadReport, *, strict: bool, name: str) -> GaussianScene:
-    """Make what a file held sound: rows without numbers go, infinite opacities and scales become finite, quats unit.
+    """Make what a file held sound: rows that mean nothing go, infinite opacities and scales become finite, quats unit.
+
+    A row means nothing if a value is no number, or its rotation is zero.
 
     strict  raise BitstreamError instead of dropping rows
     """
@@ -206,11 +247,14 @@ def cleaned(scene: GaussianScene, report: ReadReport, *, strict: bool, name: str
             sound &= np.isfinite(values).all(1)
     sound &= ~np.isnan(scene.opacity_logits)
     sound &= ~(np.isnan(scene.log_scales) | (scene.log_scales == np.inf)).any(1)
-    if not sound.all():
-        report.dropped = int((~sound).sum())
+    with np.errstate(invalid="ignore"):
+        still = sound & ~(np.abs(scene.quats).max(axis=1, initial=0) > SHORTEST_QUAT)
+    if not sound.all() or still.any():
+        left = LeftOut(int((~sound).sum()), int(still.sum()))
+        report.dropped, report.left_out = sum(left), left._asdict()
         if strict:
-            raise BitstreamError(f"{name}: {report.dropped:,} Gaussians hold values that are no finite numbers")
-        scene = scene.select(sound)
+            raise BitstreamError(f"{name}: {str(left).replace(' and were left out', '')}")
+        scene = scene.select(sound & ~still)
     scales, logits = scene.log_scales, scene.opacity_logits
     if (infinite := scales == -np.inf).any():
         report.repaired("log_scales", int(infinite.sum()))
@@ -218,8 +262,7 @@ def cleaned(scene: GaussianScene, report: ReadReport, *, strict: bool, name: str
     if (infinite := np.isinf(logits)).any():
         report.repaired("opacity_logits", int(infinite.sum()))
         logits = np.where(infinite, np.copysign(np.float32(LARGEST_LOGIT), logits), logits)
-    quats, null = normalised(scene.quats)
-    report.repaired("quats", null)
+    quats, _ = normalised(scene.quats)
     report.num_gaussians, report.sh_degree = scene.num_gaussians, scene.sh_degree
     return replace(scene, log_scales=scales, opacity_logits=logits, quats=quats, report=report)
 

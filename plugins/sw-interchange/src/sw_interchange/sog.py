@@ -153,6 +153,7 @@ def read_sog(source: Source, limits: Limits, report: ReadReport) -> GaussianScen
     # An image has 4 bytes a texel and at most two texels a Gaussian; that of the SH palette has 2^22 bytes.
     bundle.largest = min(limits.max_output_bytes, 8 * count + (1 << 23))
     images = _checked_images(bundle, count)
+    limits.check(count, 56 * count, bundle.name, len(source.data) + sum(len(data) for _, data in images))
     shared = {name: _texels(data, name, count) for name, data in images}
     low, high, scales, quats, sh0 = shared.values()
     return GaussianScene(

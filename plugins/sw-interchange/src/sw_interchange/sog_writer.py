@@ -65,6 +65,8 @@ def sog_files(scene: GaussianScene, options: SogOptions, report: WriteReport) ->
         return name
 
     steps, bounds = _positions(scene.means)
+    spans = np.subtract(bounds["maxs"], bounds["mins"])
+    report.coarse(spans / 65535 * (1 + np.abs(scene.means.astype(np.float64))), scene.means, scene.log_scales)
     scales, dc = scalar_codebook(scene.log_scales), scalar_codebook(scene.sh_dc)
     alphas = np.clip(np.rint(255 * sigmoid(scene.opacity_logits)), 1, 255).astype(np.uint8)
     meta: dict[str, Any] = {

@@ -114,7 +114,7 @@ def _open_123(source: Source, limits: Limits) -> _Header:
         raise BitstreamError(f"{name}: version {header.version} is not gzipped", section="header")
     sizes = field_sizes(header.count, header.version, header.degree)
     whole = 16 + sum(sizes)
-    limits.check(header.count, whole, name)
+    limits.check(header.count, whole, name, len(source.data))
     # Deflate makes at most 1032 bytes of one: a count beyond that is a lie, told before anything is allocated.
     if whole > len(source.data) * (1032 if packed else 1):
         raise BitstreamError(f"{name}: claims {header.count:,} Gaussians, too many for its size: it is truncated")
@@ -141,7 +141,7 @@ def _open_4(source: Source, limits: Limits) -> _Header:
         raise BitstreamError(f"{name}: {streams} streams, degree {header.degree} has {len(sizes)}", section="header")
     if header.count > _most_claimed(len(data)):
         raise BitstreamError(f"{name}: claims {header.count:,} Gaussians, too many for its size", section="header")
-    limits.check(header.count, sum(sizes), name)
+    limits.check(header.count, sum(sizes), name, len(data))
     at = start + 16 * streams
     if start < 32 or at > len(data):
         raise BitstreamError(f"{name}: its table of contents lies outside of the file", section="contents")
@@ -221,4 +221,6 @@ def _fractional_bits(scene: GaussianScene, options: SpzOptions, report: WriteRep
     if room < options.fractional_bits:
         report.warnings.append(f"coordinates reach to {largest:.4g}: {room} fractional bits instead of "
                                f"{options.fractional_bits}")  # fmt: skip
-    return min(room, options.fractional_bits)
+    bits = min(room, options.fractional_bits)
+    report.coarse(np.float64(2.0**-bits), scene.means, scene.log_scales)
+    return bits

@@ -5,6 +5,7 @@ Source: LightGaussian (arXiv 2311.17245), section on global significance, and fa
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal
 
@@ -19,7 +20,9 @@ if TYPE_CHECKING:
 
     from splatwizard_core.api import Camera, Rasterizer, SplatModel
 
-Kind = Literal["v_important_score", "important_score", "max_v_important_score", "count", "opacity"]
+Kind = Literal["v_important_score", "v_tile_score", "important_score", "max_v_important_score", "count", "opacity"]
+TILE = 16
+"""Pixels along the side of a tile of the published kernel."""
 
 
 class SignificanceSettings(Params):
@@ -37,6 +40,9 @@ class Significance:
     """Scores by name as in the authors' code; sums run over every pixel of every view that a Gaussian is blended into.
 
     kind                v_important_score: sum of opacity x transmittance, times (volume / reference)^v_pow;
+                        v_tile_score: the same, but in each view its mean over the pixels counts as often as there are
+                        tiles under a disc of so many pixels. The threads of a tile overwrite each other's sums in the
+                        authors' kernel, so that about this is left, and large Gaussians get less by far;
                         important_score: that sum; max_v_important_score: it times the largest scale;
                         count: how many pixels; opacity: the opacity of what is seen at all
     v_pow               0: the volume does not count
@@ -68,7 +74,7 @@ class Significance:
             raise TypeError(f"the pruner 'lightgaussian' scores a GaussianModel, not a {type(model).__name__}")
         hits, caught = self._sums(model, cameras, rasterizer, background)
         if self.kind == "count":
-            found = hits.double()
+            found = hits
         elif self.kind == "opacity":
             found = model.opacities.detach().double()
         else:
@@ -79,21 +85,33 @@ class Significance:
         """[N], what the sum is multiplied by."""
         if self.kind == "max_v_important_score":
             return log_scales.amax(dim=1).exp()
-        return volume_factor(log_scales, self.v_pow, self.volume_norm) if self.kind == "v_important_score" else 1.0
+        if self.kind in ("v_important_score", "v_tile_score"):
+            return volume_factor(log_scales, self.v_pow, self.volume_norm)
+        return 1.0
 
     @torch.no_grad()
     def _sums(
         self, model: GaussianModel, cameras: Sequence[Camera], rasterizer: Rasterizer, background: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        """[N] int64 pixels and [N] float64 sum of opacity x transmittance, over all views."""
+        """[N] float64 each: pixels, and the sum of opacity x transmittance over them or over tiles, in all views."""
         kind = "opacity_T" if self.use_transmittance else "opacity"
         options = RasterOptions(background=background, scores=(ScoreSpec("hits", "hits"), ScoreSpec("caught", kind)))
-        hits = torch.zeros(model.num_rows, dtype=torch.int64, device=model.device)
+        hits = torch.zeros(model.num_rows, dtype=torch.float64, device=model.device)  # whole numbers up to 2^53
         caught = torch.zeros(model.num_rows, dtype=torch.float64, device=model.device)
         for camera in cameras:
             camera = camera.to(model.device)
             # One view at a time: a rasterizer returns its sums as int32 and float32.
             view = rasterizer.accumulate(model.gaussians(camera, rasterizer), [camera], options).scores
-            hits += view["hits"].long()
-            caught += view["caught"]
+            seen, share = view["hits"].double(), view["caught"].double()
+            if self.kind == "v_tile_score":
+                share = share * (tiles_under(seen) / seen.clamp_min(1))
+            hits += seen
+            caught += share
         return hits, caught
+
+
+def tiles_under(pixels: Tensor) -> Tensor:
+    """Tiles that a square as wide as a disc of so many `pixels` [N] touches on average over its places; 0 of none."""
+    width = (pixels * (4 / math.pi)).sqrt()
+    # A line of w pixels, w >= 1, touches (w - 1) / TILE + 1 tiles on average.
+    return torch.where(pixels > 0, ((width - 1).clamp_min(0) / TILE + 1).square(), 0.0)

@@ -16,6 +16,7 @@ from splatwizard_core.tooling import (
     Session,
     bytes_with_named,
     open_model,
+    read_gaussians,
     render_options,
     render_view,
     suggested_rasterizers,
@@ -58,7 +59,7 @@ def open_file(path: Path, session: Session, resolved: ResolvedConfig, background
     plugins = session.plugins
     importer = plugins.importers.of_suffix(path)
     if importer is not None:
-        gaussians = plugins.read_gaussians(path)
+        gaussians = read_gaussians(path, plugins)
         model: SplatModel = gaussians.to(session.device).eval().requires_grad_(False)
         kind, raster = importer, dict(gaussians.origin.get("raster", {}))
     else:

@@ -87,20 +87,23 @@ def _part(facts: dict[str, Any], *names: str) -> dict[str, Any]:
 
 
 def _gaussian_facts(path: Path) -> dict[str, Any]:
-    model = load_plugins().read_gaussians(existing(path))
+    from splatwizard_core.runs.decode import read_gaussians
+
+    model = read_gaussians(existing(path), load_plugins())
     means, scales, opacities = model.means.detach(), model.scales.detach(), model.opacities.detach()
-    sound = means.isfinite().all(1) & scales.isfinite().all(1) & opacities.isfinite()
-    known = bool(sound.any())  # else there is no box and no median
+    known = bool(model.num_rows)  # else there is no box and no median
+    facts = dict(model.origin)
+    left = facts.pop("left_out", {"not_finite": 0, "zero_rotation": 0})
     return {
         "path": str(path),
         "size": path.stat().st_size,
-        **model.origin,
+        **facts,
         **model.counts(),
-        "not_finite": int((~sound).sum()),
+        **left,
         "sh_degree": model.max_sh_degree,
-        "box": {"min": means[sound].amin(0).tolist(), "max": means[sound].amax(0).tolist()} if known else None,
-        "median_scale": float(scales[sound].median()) if known else None,
-        "median_opacity": float(opacities[sound].median()) if known else None,
+        "box": {"min": means.amin(0).tolist(), "max": means.amax(0).tolist()} if known else None,
+        "median_scale": float(scales.median()) if known else None,
+        "median_opacity": float(opacities.median()) if known else None,
     }
 
 

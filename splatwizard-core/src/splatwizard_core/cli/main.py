@@ -130,6 +130,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     return status if isinstance(status, int) else 0
 
 
+MOST_TOLD = 3000
+"""Characters of an error message."""
+
+
 def _report(error: BaseException, arguments: Sequence[str], *, debug: bool) -> int:
     """One or two lines on stderr, and the exit status that the error leads to."""
     if VARIABLE in os.environ and isinstance(error, ForeseenError):
@@ -188,5 +192,7 @@ def _culprit(error: BaseException, arguments: Sequence[str]) -> str:
 
 
 def _say(text: str) -> None:
+    if len(text) > MOST_TOLD:  # a stranger's key or name stands in it
+        text = f"{text[: MOST_TOLD // 2]} ... {text[-MOST_TOLD // 4 :]}"
     with contextlib.suppress(OSError):  # nobody reads it: the exit status must do
         print(without_orders(as_installed(text)), file=sys.stderr, flush=True)

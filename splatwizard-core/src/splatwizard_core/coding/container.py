@@ -46,6 +46,8 @@ NAME = re.compile(r"(?!header$)[A-Za-z0-9_][A-Za-z0-9_./-]{0,63}")  # "header" w
 METHOD_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
 PREFIX = struct.Struct("<4sHI")
 CRC = struct.Struct("<I")
+WORLD_ORIGIN = "world_origin"
+"""Header value beside those of the method: where the origin of the coordinates lies in the world of the scene."""
 HEADER = {"method": str, "method_version": int, "raster": dict, "static": dict, "sections": list}
 
 
@@ -77,6 +79,7 @@ class ContainerWriter:
         self.method, self.version = method, version
         self.raster: dict[str, Any] = dict(raster or {})
         self.static: dict[str, Any] = {}
+        self.world_origin: tuple[float, float, float] | None = None
         self.requires: list[Requirement] = []
         self.required: list[tuple[str, str]] = []
         self._sections: dict[str, bytes] = {}
@@ -133,7 +136,7 @@ class ContainerWriter:
                 "method_version": self.version,
                 **({"requires": dump_requirements(self.requires)} if self.requires else {}),
                 "raster": self.raster,
-                "static": self.static,
+                "static": self.static | ({WORLD_ORIGIN: list(self.world_origin)} if self.world_origin else {}),
                 "sections": table,
             }
         )
@@ -161,6 +164,7 @@ class ContainerReader:
     method, version     which method decodes it, and the version of its layout
     requires            which distributions wrote it; empty if the file does not say
     raster, static      header values, plain JSON data
+    world_origin        where the origin of the coordinates lies in the world of the scene, unchecked; None: not told
     sections            bytes of each section, in file order
     size                bytes of the whole file = header_bytes + the sum over `sections`
 
@@ -197,6 +201,7 @@ class ContainerReader:
             raise self._damage(str(error), "header") from error
         self.raster: dict[str, Any] = header["raster"]
         self.static: dict[str, Any] = header["static"]
+        self.world_origin = self.static.pop(WORLD_ORIGIN, None)  # of the scene, no value of the method
         self._payload = self._split(header["sections"], file)
         self.sections: dict[str, int] = {key: len(part) for key, part in self._payload.items()}
         self._unread = set(self._payload)
@@ -402,7 +407,7 @@ class ContainerReader:
             "method_version": self.version,
             "requires": {each.distribution: each.version for each in self.requires},
             "raster": self.raster,
-            "static": self.static,
+            "static": self.static | ({WORLD_ORIGIN: self.world_origin} if self.world_origin is not None else {}),
             "size": self.size,
             "bytes": {"header": self.header_bytes, **self.sections},
         }

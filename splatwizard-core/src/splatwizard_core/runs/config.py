@@ -6,6 +6,7 @@ import functools
 import hashlib
 import json
 import os
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -33,6 +34,9 @@ else:
 
 __all__ = ["ResolvedConfig", "apply_overrides", "parse_set", "rate_points", "read_config_file", "resolve"]
 
+MAX_TOML = 1 << 20  # bytes of a configuration file
+MAX_PARTS = 50
+DEEP_KEY = re.compile(rf"""(?<![\w"'-])(?:[\w"'-]+[ \t]*\.[ \t]*){{{MAX_PARTS}}}""")
 RESERVED = ("method", "preset", "rate", "scene")
 SCENE_KEYS = tuple(SceneParams.model_fields)
 PRETRAINED = "pretrained."  # keys of the method whose trained scene a run starts from
@@ -202,14 +206,33 @@ def rate_points(method: type[Method], asked: str) -> list[str]:
     return sorted(set(found), key=names.index)
 
 
+def parse_toml(text: str, path: str | Path) -> dict[str, Any]:
+    """Parse a TOML file of a stranger in bounded time and memory. Raises ConfigError.
+
+    Keys of thousands of parts take the parser gigabytes, brackets of as many levels the interpreter's stack.
+    """
+    if len(text) > MAX_TOML:
+        raise ConfigError(f"{path} has more than {MAX_TOML:,} bytes: no configuration is so long")
+    if deep := DEEP_KEY.search(text):
+        line = text.count("\n", 0, deep.start()) + 1
+        raise ConfigError(f"{path}, line {line}: a key of more than {MAX_PARTS} parts: no configuration is so deep")
+    try:
+        tables: dict[str, Any] = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        reason = "its brackets are nested too deeply" if isinstance(error, RecursionError) else error
+        raise ConfigError(f"{path} is not valid TOML: {reason}") from None
+    return tables
+
+
 def read_config_file(path: str | Path) -> dict[str, Any]:
     """Read the tables of a TOML file, its names checked. Raises ConfigError that names the line or the key."""
     try:
         with open(path, "rb") as file:
-            tables: dict[str, Any] = tomllib.load(file)
+            content = file.read(MAX_TOML + 1)
+        tables = parse_toml(content.decode(), path)
     except OSError as error:
         raise ConfigError(f"cannot read --config {path}: {error.strerror or error}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError as error:
         raise ConfigError(f"{path} is not valid TOML: {error}") from error
     for name in RESERVED:
         value = tables.get(name, "a name")
@@ -299,7 +322,10 @@ def resolve(
         ppl = apply_overrides(ppl, given[PipelineParams], source=source)
         reading = apply_overrides(reading, given[SceneParams], source=source)
     config = config.completed(plugins, provenance)
-    scene_options = SceneOptions(**reading.model_dump(), seed=ppl.seed)
+    reading_values = reading.model_dump()
+    if reading_values["split"] is not None and os.path.isfile(reading_values["split"]):
+        reading_values["split"] = os.path.abspath(reading_values["split"])  # other processes have other folders
+    scene_options = SceneOptions(**reading_values, seed=ppl.seed)
     return ResolvedConfig(
         method.name, preset, rate, scene_spec, config, ppl, scene_options, provenance, init, pretrained,
         check_settings(plugins.metrics, settings) if settings else {}, procedural,

@@ -16,6 +16,8 @@ from splatwizard_core.coding.container import ContainerReader
 from splatwizard_core.errors import BitstreamError, PluginError, SplatwizardError, UserInputError
 from splatwizard_core.evaluation.speed import spread
 from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.gaussians.placement import NOWHERE, as_origin, with_origin
+from splatwizard_core.gaussians.sound import leave_out_senseless
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.method import Method
 from splatwizard_core.plugins import PluginManager
@@ -27,15 +29,26 @@ from splatwizard_native import CoreTime, MemoryMeter, replacing, synchronize, tr
 REPEATS = 3
 
 
-def open_model(path: str | Path, plugins: PluginManager, device: torch.device) -> tuple[SplatModel, ContainerReader]:
+def read_gaussians(path: Path, plugins: PluginManager) -> GaussianModel:
+    """Return the explicit Gaussians of a file of another format, without the rows that mean nothing."""
+    return leave_out_senseless(plugins.read_gaussians(path), path.name)
+
+
+def open_model(
+    path: str | Path, plugins: PluginManager, device: torch.device, *, tell: bool = True
+) -> tuple[SplatModel, ContainerReader]:
     """Return the decoded model, ready to render on `device`, and the file it came from.
+
+    tell    log what was left out of it
 
     Raises BitstreamError for a damaged file, PluginError if something that it needs is not installed.
     """
     reader = ContainerReader.open(path)
     model = decode_model(reader, plugins).to(device).eval().requires_grad_(False)
     if isinstance(model, GaussianModel):
+        model = leave_out_senseless(model, reader.name, tell=tell)
         model.origin = {**model.origin, "raster": reader.raster}
+        with_origin(model, as_origin(reader.world_origin) or NOWHERE)
     return model, reader
 
 
@@ -94,10 +107,10 @@ def timed_decode(path: Path, session: Session, *, repeats: int = REPEATS) -> tup
     """
     device = session.device
 
-    def once() -> tuple[SplatModel, ContainerReader, float]:
+    def once(*, tell: bool = False) -> tuple[SplatModel, ContainerReader, float]:
         synchronize(device)
         began = time.perf_counter()
-        model, reader = open_model(path, session.plugins, device)
+        model, reader = open_model(path, session.plugins, device, tell=tell)
         synchronize(device)
         return model, reader, time.perf_counter() - began
 
@@ -108,7 +121,7 @@ def timed_decode(path: Path, session: Session, *, repeats: int = REPEATS) -> tup
     meter = MemoryMeter(device)
     meter.start()
     with track(f"decode {path.name}", total=1 + repeats) as bar:
-        model, reader, first = once()
+        model, reader, first = once(tell=True)
         peak = meter.peak_bytes()
         digest = model.digest()
         bar.advance()

@@ -15,12 +15,14 @@ from splatwizard_core.coding.container import ContainerWriter
 from splatwizard_core.coding.requirements import Requirement
 from splatwizard_core.errors import SplatwizardError, UserInputError
 from splatwizard_core.evaluation.evaluate import kept_header
+from splatwizard_core.gaussians.placement import NOWHERE, Origin, origin_of
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.method import Method
 from splatwizard_core.plugins import Entry
 from splatwizard_core.plugins.catalogue import CORE
 from splatwizard_core.runs.config import ResolvedConfig
 from splatwizard_core.runs.contention import contention
+from splatwizard_core.runs.decode import read_gaussians
 from splatwizard_core.runs.directory import RunRequest
 from splatwizard_core.runs.lock import directory_lock
 from splatwizard_core.runs.phases import part_of, unique
@@ -35,11 +37,18 @@ NEEDED_KINDS = ("method", "quantizer", "entropy model", "context model", "coder"
 
 
 def encode(
-    method: Method, model: SplatModel, raster: dict[str, Any], path: Path, *, deterministic: bool = False
+    method: Method,
+    model: SplatModel,
+    raster: dict[str, Any],
+    path: Path,
+    origin: Origin = NOWHERE,
+    *,
+    deterministic: bool = False,
 ) -> dict[str, Any]:
     """Write one file; returns the facts of the encoding, for the record and for what is done again later.
 
     raster          what the header asks of a rasterizer
+    origin          where the origin of the model's coordinates lies in the world
     deterministic   equal models give equal bytes on CUDA too: a method may train codebooks here
 
     The clock runs from the trained model to the closed file. Raises SplatwizardError if the method changes the model.
@@ -51,6 +60,8 @@ def encode(
     ordered = one_order_of_sums() if deterministic else contextlib.nullcontext()
     with torch.no_grad(), ordered, method.plugins.recording() as loaded:
         method.encode(model, writer)
+    if any(origin):
+        writer.world_origin = origin
     loaded += [method.plugins.registries[kind].entry(name) for kind, name in writer.required]
     if method.name in method.plugins.methods:
         loaded.insert(0, method.plugins.methods.entry(method.name))
@@ -102,7 +113,8 @@ def encode_directory(session: Session, resolved: ResolvedConfig, directory: Path
     """Encode the finished training of a run directory. Raises UserInputError if it is not finished."""
     with finished_training(session, resolved, directory) as trained:
         method, raster = make_method(session.plugins, resolved), trained.facts["raster"]
-        return encode(method, trained.model, raster, target, deterministic=resolved.ppl.deterministic)
+        origin = session.scene(resolved).origin
+        return encode(method, trained.model, raster, target, origin, deterministic=resolved.ppl.deterministic)
 
 
 def encode_ply(session: Session, resolved: ResolvedConfig, path: Path, target: Path) -> dict[str, Any]:
@@ -110,11 +122,12 @@ def encode_ply(session: Session, resolved: ResolvedConfig, path: Path, target: P
     session.load_kernels()
     if session.plugins.importers.of_suffix(path) is None:
         raise UserInputError(f"{path}: `sw encode` takes a run directory or a .ply")
-    model = session.plugins.read_gaussians(path).to(session.device).eval().requires_grad_(False)
+    model = read_gaussians(path, session.plugins).to(session.device).eval().requires_grad_(False)
     method = make_method(session.plugins, resolved)
     last = list(method.stages())[-1]
     raster = kept_header(model, last.raster_options(last.iterations, torch.zeros(3)), resolved.ppl.raster.options)
     try:
-        return encode(method, model, raster, target, deterministic=resolved.ppl.deterministic)
+        origin = origin_of(model) or NOWHERE
+        return encode(method, model, raster, target, origin, deterministic=resolved.ppl.deterministic)
     except (TypeError, AttributeError) as error:
         raise UserInputError(f"method '{method.name}' does not encode a .ply of explicit Gaussians: {error}") from error

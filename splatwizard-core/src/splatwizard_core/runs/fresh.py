@@ -7,7 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +21,12 @@ class FreshProcessError(SplatwizardError):
     """The other process failed; its own message stands on stderr already."""
 
 
-def run_fresh(arguments: Sequence[str], *, alone_in: Path | None = None) -> dict[str, Any]:
+def run_fresh(arguments: Sequence[str], *, alone_in: Path | None = None, told: Collection[str] = ()) -> dict[str, Any]:
     """Run `sw ARGUMENTS` in a new interpreter and return the JSON object that it prints.
 
     alone_in    working directory of one that must not find data sets: what names their folders is not in its
                 environment; None: it has ours
+    told        lines that the user has read already: they are not repeated
 
     Its progress and messages go to our stderr. Raises UserInputError or FreshProcessError with its own message if
     it fails, KeyboardInterrupt if it was interrupted.
@@ -42,16 +43,16 @@ def run_fresh(arguments: Sequence[str], *, alone_in: Path | None = None) -> dict
     finally:
         os.close(ours)
         os.close(theirs)
-    told = (done.stderr or "").strip()
+    said = "\n".join(line for line in (done.stderr or "").strip().splitlines() if line not in told)
     name = f"sw {arguments[0]}"
     if done.returncode == 130:
         raise KeyboardInterrupt
     if done.returncode != 0:
-        last = told.splitlines()[-1].removeprefix("error: ") if told else "see above"
+        last = said.splitlines()[-1].removeprefix("error: ") if said else "see above"
         kind = UserInputError if done.returncode == 2 else FreshProcessError
         raise kind(f"`{name}` in a fresh process failed (status {done.returncode}): {last}")
-    if told:
-        print(told, file=sys.stderr, flush=True)
+    if said:
+        print(said, file=sys.stderr, flush=True)
     try:
         if isinstance(content := json.loads(done.stdout), dict):
             return content

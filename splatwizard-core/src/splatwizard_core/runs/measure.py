@@ -13,17 +13,17 @@ import torch
 from splatwizard_core.evaluation import evaluate as quality
 from splatwizard_core.evaluation.metrics import MetricSetup, chosen_metrics
 from splatwizard_core.evaluation.speed import SpeedReport, measure_speed
+from splatwizard_core.gaussians.placement import placed_in
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.runs.config import ResolvedConfig
 from splatwizard_core.runs.contention import contention
-from splatwizard_core.runs.decode import import_method, open_model
+from splatwizard_core.runs.decode import import_method, open_model, read_gaussians
 from splatwizard_core.runs.environment import describe_environment
 from splatwizard_core.runs.record import MemoryBlock, MetricBlock, SpeedBlock, picked
 from splatwizard_core.runs.session import Session
 from splatwizard_core.runs.training_views import training_psnr
 from splatwizard_core.scene.camera import Camera
-from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.scene.scene import Scene
 from splatwizard_native import CoreTime, MemoryMeter, synchronize
 
@@ -77,8 +77,9 @@ def measure(
     synchronize(device)
     open_s = time.perf_counter() - began
     decoded_bytes, peak_load = meter.current_bytes(), meter.peak_bytes()
-    bad_rows = model.check_finite()
-    scene = load_scene(resolved.scene_spec, resolved.scene, plugins)
+    bad_rows = model.check_finite() + sum(getattr(model, "origin", {}).get("left_out", {}).values())
+    scene = session.scene(resolved)
+    placed_in(model, scene)
     options = quality.render_options(raster, scene.background.to(device))
     rasterizer = session.rasterizer(resolved, quality.suggested_rasterizers(raster))
     views = scene.test
@@ -128,6 +129,8 @@ def measure(
     found = {
         "dataset": scene.protocol.dataset,
         "scene": scene.name,
+        "scene_warnings": list(scene.warnings),
+        "scene_origin": list(scene.origin),
         "protocol": {"id": scene.protocol.id, **asdict(scene.protocol)},
         "train_views": len(scene.train),
         "test_views": len(views),
@@ -191,7 +194,7 @@ def opener(path: Path, session: Session) -> Callable[[], Opened]:
 
     def open_file() -> Opened:
         if not encoded:
-            gaussians = session.plugins.read_gaussians(path)
+            gaussians = read_gaussians(path, session.plugins)
             raster = gaussians.origin.get("raster", {})
             return Opened(gaussians.to(session.device).eval().requires_grad_(False), raster)
         model, reader = open_model(path, session.plugins, session.device)
@@ -207,6 +210,7 @@ def open_subject(path: Path, session: Session, resolved: ResolvedConfig, scene: 
     model, raster, _, static = opener(path, session)()
     model.check_finite()
     scene = scene or session.scene(resolved)
+    placed_in(model, scene, path.name)
     rasterizer = session.rasterizer(resolved, quality.suggested_rasterizers(raster))
     with torch.no_grad():
         model.prepare()

@@ -17,6 +17,7 @@ from typing import Any
 
 from splatwizard_core.errors import ConfigError, SplatwizardError, UserInputError
 from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.gaussians.sound import leave_out_senseless
 from splatwizard_core.method import Method
 from splatwizard_core.plugins import PluginManager, load_plugins
 from splatwizard_core.runs.config import INIT, ResolvedConfig, content_hash, resolve
@@ -180,13 +181,10 @@ def check_model(path: str) -> GaussianModel:
         if file.read(4) == b"SPWZ":
             raise UserInputError(f"init: {path} is an encoded file: `sw export {path} FILE.ply` makes a .ply of it")
     try:
-        model = load_plugins().read_gaussians(where)
+        model = leave_out_senseless(load_plugins().read_gaussians(where), where.name)
     except SplatwizardError as error:
         reason = str(error).removeprefix(f"{where}: ").removeprefix(f"{where.name}: ")
         raise UserInputError(f"init: {path}: {reason}") from None
     if model.num_rows == 0:
         raise UserInputError(f"init: {path} holds no Gaussian")
-    damaged = sum(int((~getattr(model, name).isfinite()).sum()) for name in model.ROWS)
-    if damaged:
-        raise UserInputError(f"init: {path}: {damaged:,} of its values are not finite numbers")
     return model

@@ -221,6 +221,10 @@ class Record(Part):
     config_hash: str | None
     dataset: str
     scene: str
+    scene_warnings: list[str] = Field([], description="what was found in the scene and not used as it stands")
+    scene_origin: tuple[float, float, float] = Field(
+        (0.0, 0.0, 0.0), description="where the origin of model and cameras lies in the world of the scene's files"
+    )
     protocol: ProtocolBlock
     train_views: int
     test_views: int

@@ -45,8 +45,8 @@ def run(session: Session, request: RunRequest) -> tuple[schema.Record, Path]:
         def encode_it() -> dict[str, Any]:
             trained = train_in(session, request, directory)
             method = make_method(session.plugins, resolved)
-            deterministic = resolved.ppl.deterministic
-            facts = encode(method, trained.model, trained.facts["raster"], encoded, deterministic=deterministic)
+            raster, origin = trained.facts["raster"], session.scene(resolved).origin
+            facts = encode(method, trained.model, raster, encoded, origin, deterministic=resolved.ppl.deterministic)
             session.say(f"encoded {facts['bytes']:,} bytes in {facts['encode_s']:.2f} s")
             return facts
 
@@ -60,7 +60,7 @@ def run(session: Session, request: RunRequest) -> tuple[schema.Record, Path]:
             arguments = ["eval", str(encoded), "--config", str(directory / CONFIG), "--device", str(session.device)]
             arguments += ["--renders", str(directory / RENDERS), "--repeats", str(request.repeats), "--quiet", "--json"]
             arguments += ["--geometry"] * request.geometry
-            return {**run_fresh(arguments), "asked": asked}
+            return {**run_fresh(arguments, told=session.told), "asked": asked}
 
         encoding = steps.once(
             "encode", content_hash([train_key, resolved.config_content()]), encode_it,

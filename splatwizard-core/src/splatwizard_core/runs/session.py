@@ -41,11 +41,13 @@ class Session:
 
     device  where models live
     say     takes one-line messages for the user
+    told    warnings of scenes that were said, which another process for the same run need not repeat
     """
 
     plugins: PluginManager
     device: torch.device
     say: Callable[[str], None]
+    told: list[str] = field(default_factory=list)
     _made: dict[Hashable, Any] = field(default_factory=dict)
     _models: dict[Role, TrainedModel] = field(default_factory=dict)
 
@@ -65,7 +67,9 @@ class Session:
                 raise SceneError(f"no scene is named, and the default one is not there: pip install {package}")
             scene = load_scene(resolved.scene_spec, resolved.scene, self.plugins)
             for warning in scene.warnings:
-                self.say(f"scene {scene.name}: {warning}")
+                line = f"scene {scene.name}: {warning}"
+                self.told.append(line)
+                self.say(line)
             return scene
 
         return self.once(("scene", resolved.scene_spec, resolved.scene), load)

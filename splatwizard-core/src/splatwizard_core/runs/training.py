@@ -10,6 +10,7 @@ from typing import Any
 from splatwizard_core.errors import SplatwizardError
 from splatwizard_core.evaluation.evaluate import evaluate, kept_header, raster_header
 from splatwizard_core.evaluation.metrics import quick_metrics
+from splatwizard_core.gaussians.placement import placed_in
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.plugins import Entry
 from splatwizard_core.runs import pretrained
@@ -93,7 +94,7 @@ def trained_scene(session: Session, name: str, outer: ResolvedConfig, out: Path)
     """
     if outer.init and name == pretrained.first_scene(pretrained.make_method(session.plugins, outer)):
         session.say_once(f"{outer.method} starts from {outer.init} in place of a trained {name} scene")
-        return session.once(("model", outer.init), lambda: _scene_of_file(session, Path(outer.init)))
+        return session.once(("model", outer.init), lambda: _scene_of_file(session, Path(outer.init), outer))
     resolved = pretrained.base_config(session.plugins, name, outer)
     key = pretrained.training_key(session, resolved)
     kept = session.kept("start", key)
@@ -117,10 +118,11 @@ def trained_scene(session: Session, name: str, outer: ResolvedConfig, out: Path)
     return found
 
 
-def _scene_of_file(session: Session, path: Path) -> TrainedModel:
+def _scene_of_file(session: Session, path: Path, outer: ResolvedConfig) -> TrainedModel:
     """Return the explicit Gaussians of a .ply as a trained scene, frozen. Nobody knows how it was trained."""
     digest = session.file_digest(path)
-    model = pretrained.check_model(str(path)).to(session.device).eval().requires_grad_(False)
+    found = placed_in(pretrained.check_model(str(path)), session.scene(outer), path.name)
+    model = found.to(session.device).eval().requires_grad_(False)
     return TrainedModel(model, digest, {"train_s": None, "file": {"name": path.name, "sha256": digest}})
 
 

@@ -18,11 +18,11 @@ class SceneOptions:
     images          picture folder of a COLMAP scene, such as "images_2"
     resolution      -1 (1600 px rule), 1, 2, 4, 8, or a width in pixels
     test_every      every n-th view by name is a test view: split "every<n>" in short
-    split           "every8" and the like, "lod:30", "file", "all"
+    split           "every8" and the like, "lod:30", "file", "all", or the path of a file of view names
     background      "black" or "white"
     principal_point "center" or "file"
-    mask_background pictures with alpha are cut out (alpha times colour on the background); False: alpha is a mask only.
-                    Blender scenes are always cut out
+    mask_background pictures are cut out by alpha or mask (alpha times colour on the background); False: alpha is a
+                    mask only. Blender scenes are always cut out
     legacy_8bit_composite   Blender pictures are composited on the background at load, in 8 bit with truncation, as the
                     3DGS code does; False: in float where they are used
     init_points     how many random start points where there is no SfM
@@ -35,8 +35,8 @@ class SceneOptions:
     test_every: int | None = None
     split: str | None = None
     background: Literal["black", "white"] | None = None
-    principal_point: Literal["center", "file"] = "center"
-    mask_background: bool = False
+    principal_point: Literal["center", "file"] | None = None
+    mask_background: bool | None = None
     legacy_8bit_composite: bool = False
     init_points: int = 100_000
     seed: int = 0

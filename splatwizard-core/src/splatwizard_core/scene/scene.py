@@ -133,6 +133,8 @@ class Scene:
                     and "scale_mats" [n,4,4] float64, n views by name (their product projects the scene's units to
                     pixels, scale_mats[0] takes them to millimetres); often empty
     warnings    one-line facts the user should see (dropped points, off-centre principal point)
+    origin      where the scene's origin lies in the world of its files: cameras and points of a georeferenced scene
+                are moved, in double precision, since float32 has steps of half a metre there; 0 for most scenes
     """
 
     name: str
@@ -143,6 +145,7 @@ class Scene:
     path: str | None = None
     ground_truth: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def background(self) -> Tensor:

@@ -100,7 +100,9 @@ class OptimizationParams(Params):
     FULL_ITERATIONS: ClassVar[int] = 30_000
     ENCODING: ClassVar[tuple[str, ...]] = ("codec",)
 
-    iterations: int = Field(30_000, ge=1, description="steps; plans keep their ranges, tasks past the end never fire")
+    iterations: int = Field(
+        30_000, ge=1, le=1_000_000_000, description="steps; plans keep their ranges, tasks past the end never fire"
+    )
     scale_schedule: bool = Field(
         False, description="multiply plan bounds, intervals and lr max_steps by iterations / those of a full run"
     )

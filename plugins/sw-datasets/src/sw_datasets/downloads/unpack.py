@@ -25,7 +25,7 @@ from splatwizard_core.api import track
 from splatwizard_core.tooling import new_folder
 from sw_datasets.downloads.download import byte_progress
 from sw_datasets.errors import ArchiveError, FetchError
-from sw_datasets.pictures import is_inside
+from sw_datasets.picture_names import is_inside
 from sw_datasets.zip_methods import check_method
 
 MAX_MEMBERS = 200_000

@@ -3,38 +3,40 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from splatwizard_core.api import Camera, PointCloud, Scene, SceneError, SceneOptions, View
+from splatwizard_core.api import Camera, PointCloud, Scene, SceneError, SceneOptions
 from sw_datasets.assemble import assemble_scene
 from sw_datasets.families import COLMAP
-from sw_datasets.loaders.colmap_model import ColmapCamera, ColmapImage, ColmapPoints, read_model
-from sw_datasets.pictures import (
-    find_pictures,
-    fitted_size,
-    list_pictures,
-    load_cut_out,
-    load_mask,
-    load_picture,
-    picture_header,
-)
-from sw_datasets.rules import Rules, off_centre_warnings, rules_for, unused_option_warnings
+from sw_datasets.gate import Gate
+from sw_datasets.loaders.colmap_model import ColmapCamera, ColmapImage, ColmapPoints, count_images, read_model
+from sw_datasets.picture_names import find_pictures, list_pictures, name_key, view_name
+from sw_datasets.rules import Rules, rules_for, unused_option_warnings
+from sw_datasets.start_points import cloud_beside, points_in_sight, read_cloud
 
 PLAIN_FOCALS = {"SIMPLE_PINHOLE": 1, "PINHOLE": 2}
-RADIAL_FOCALS = {"SIMPLE_RADIAL": 1, "RADIAL": 1, "OPENCV": 2, "FULL_OPENCV": 2, "FOV": 2}
+RADIAL_FOCALS = {
+    "SIMPLE_RADIAL": 1, "RADIAL": 1, "OPENCV": 2, "FULL_OPENCV": 2, "FOV": 2, "SIMPLE_DIVISION": 1, "DIVISION": 2,
+}  # fmt: skip
 """Models that are a pinhole camera when all their coefficients are 0 -> number of focal lengths.
 
 The fisheye models are not: with zero coefficients they are still an equidistant projection.
 """
 
+PANORAMAS = ("EQUIRECTANGULAR",)
+"""Models that no undistortion makes a pinhole camera."""
+
 MAX_SIDE = 1 << 24
 """Pixels; wider is a damaged file (text may state any integer, also one that no float can hold)."""
 
+
+ELSEWHERE = ("colmap/sparse/0", "colmap/sparse", "dense/0/sparse", "dense/sparse")
+"""Folders of models that are not where COLMAP's mapper puts them."""
 
 MaskFinder = Callable[[Path, Sequence[str]], "list[Path | None]"]
 """(scene folder, image names) -> the mask file of each image, None where there is none."""
@@ -66,68 +68,96 @@ def load_colmap(path: Path, rules: Rules, options: SceneOptions, *, masks: MaskF
     if folder is None:
         raise SceneError(f"{path}: no sparse/0/cameras.bin (or .txt); run COLMAP first", path=str(path))
     model = read_model(folder)
-    if not len(model.points):
-        raise SceneError(
-            f"{folder}: the reconstruction has no 3D points (points3D is empty); run COLMAP's mapper again",
-            path=str(path),
-        )
     picture_folder = rules.images or "images"
     images = sorted(model.images.values(), key=lambda image: image.name)
     if not images:
         raise SceneError(f"{folder}: no registered image; a scene needs at least 2", path=str(path))
-    names = [image.name for image in images]
-    files = find_pictures(_existing(path, picture_folder), names)
-    warnings = _unused(path / picture_folder, len(images))
-    off_centre = 0.0
+    warnings = _other_models(path, folder)
+    root = picture_root(path, folder, picture_folder)
+    where, names = _existing(root, picture_folder), [image.name for image in images]
+    files = find_pictures(where, names, warnings)
+    warnings += _unused(where, len(images))
+    names = [view_name(name, file, where) for name, file in zip(names, files, strict=True)]
+    gate = Gate(path, rules, quiet_masks=masks is not None)
     views = []
-    for image, file, mask in zip(images, files, (masks or mask_files)(path, names), strict=True):
+    for image, name, file, mask in zip(images, names, files, (masks or mask_files)(root, names), strict=True):
         if image.camera_id not in model.cameras:
             raise SceneError(
-                f"{folder}: image '{image.name}' refers to camera {image.camera_id}, which is not in cameras",
+                f"{folder}: image '{name}' refers to camera {image.camera_id}, which is not in cameras",
                 path=str(path),
             )
         intrinsics = model.cameras[image.camera_id]
         fx, fy, cx, cy = pinhole(intrinsics, path)
-        off_centre = max(off_centre, abs(cx - intrinsics.width / 2), abs(cy - intrinsics.height / 2))
-        if rules.principal_point != "file":
-            cx, cy = intrinsics.width / 2, intrinsics.height / 2
         R, tau = pose(image)
         camera = Camera(intrinsics.width, intrinsics.height, fx, fy, cx, cy, R, tau)
-        width, height, has_alpha = picture_header(file)
-        size = fitted_size(width, height, rules.resolution)
-        if mask is None and has_alpha:
-            mask = file
-        load = partial(load_picture, file, size, alpha=has_alpha and rules.masked)
-        if rules.masked and not has_alpha:
-            if mask is None:
-                raise SceneError(
-                    f"{path}: mask_background needs a mask for every image, and '{image.name}' has neither alpha nor "
-                    "a file in masks/",
-                    path=str(path),
-                )
-            load = partial(load_cut_out, file, mask, size)
-        # The field of view is that of COLMAP's own size, whatever the size of the file: focal lengths scale along.
-        views.append(
-            View(camera.resized(*size), image.name, load, None if mask is None else partial(load_mask, mask, size))
+        picture = gate.admit(name, file, (intrinsics.width, intrinsics.height))
+        views.append(gate.view(name, picture, camera, mask))
+    warnings += gate.warnings()
+    points = point_cloud(model.points) if len(model.points) else None
+    if points is None:
+        cloud = cloud_beside(folder) or cloud_beside(path)
+        if cloud is not None:
+            points = read_cloud(cloud)
+            warnings.append(f"points3D has no point: {len(points):,} start points are those of {cloud.name}")
+    unused = ("legacy_8bit_composite", "init_points") if points is not None else ("legacy_8bit_composite",)
+    if points is None:
+        points = points_in_sight([view.camera for view in views], options.init_points, options.seed)
+        warnings.append(
+            f"the reconstruction has no 3D points: {options.init_points:,} random ones are laid where the cameras "
+            "look (init_points = N)"
         )
-    warnings += off_centre_warnings(off_centre, rules)
-    warnings += unused_option_warnings(options, ("legacy_8bit_composite", "init_points"), rules.family)
+    warnings += unused_option_warnings(options, unused, rules.family)
     return assemble_scene(
         path.resolve().name,
         views,
-        points=point_cloud(model.points),
-        protocol=rules.protocol(),
+        points=points,
+        protocol=rules.protocol(masked=gate.masked),
         path=str(path),
         warnings=warnings,
+        finds_lists=rules.finds_lists,
     )
 
 
 def model_folder(path: Path) -> Path | None:
-    """sparse/0 or sparse below `path`, whichever holds a cameras file; None if neither does."""
-    for folder in (path / "sparse" / "0", path / "sparse"):
+    """The folder of the model below `path`; None if there is none.
+
+    sparse/0 or sparse, where COLMAP puts it; else that of sparse/1, sparse/2, ... with the most images; else
+    colmap/sparse/0 or colmap/sparse (nerfstudio), dense/0/sparse or dense/sparse (COLMAP's undistorted copy).
+    """
+    usual = [path / "sparse" / "0", path / "sparse"]
+    numbered = sorted(_numbered(path / "sparse"), key=count_images, reverse=True)
+    for folder in (*usual, *numbered, *(path / place for place in ELSEWHERE)):
         if _has(folder, "cameras"):
             return folder
     return None
+
+
+def picture_root(path: Path, model: Path, pictures: str) -> Path:
+    """The folder in which the picture folder lies: the scene, or where a copy has its own, the copy."""
+    own = model.parent if model.name == "sparse" else model.parent.parent
+    return own if own != path and (own / pictures).is_dir() and not (path / pictures).is_dir() else path
+
+
+def _numbered(sparse: Path) -> list[Path]:
+    """Models in sparse/0, sparse/1, ..., by number."""
+    try:
+        with os.scandir(sparse) as entries:
+            numbers = sorted(int(each.name) for each in entries if re.fullmatch(r"\d{1,4}", each.name))
+    except OSError:
+        return []
+    return [folder for number in numbers if _has(folder := sparse / str(number), "cameras")]
+
+
+def _other_models(path: Path, chosen: Path) -> list[str]:
+    """Tell of models that are not read: COLMAP makes several where it cannot join all pictures in one."""
+    others = [each for each in _numbered(chosen.parent) if each != chosen]
+    if not others:
+        return []
+    found = ", ".join(f"{each.relative_to(path).as_posix()} ({count_images(each)} images)" for each in others[:3])
+    return [
+        f"the model in {chosen.relative_to(path).as_posix()} is read ({count_images(chosen)} images); "
+        f"there is also {found}"
+    ]
 
 
 def pinhole(camera: ColmapCamera, scene: Path) -> tuple[float, float, float, float]:
@@ -135,6 +165,12 @@ def pinhole(camera: ColmapCamera, scene: Path) -> tuple[float, float, float, flo
 
     Raises SceneError for a lens model with distortion, naming it and the command that removes it.
     """
+    if camera.model in PANORAMAS:
+        raise SceneError(
+            f"{scene}: camera {camera.id} is a panorama ({camera.model}), which no pinhole camera can be made of; cut "
+            "it into perspective pictures before the poses are made",
+            path=str(scene),
+        )
     focals = PLAIN_FOCALS.get(camera.model) or RADIAL_FOCALS.get(camera.model)
     if focals is None or any(camera.params[focals + 2 :]):
         raise SceneError(
@@ -149,7 +185,7 @@ def pinhole(camera: ColmapCamera, scene: Path) -> tuple[float, float, float, flo
 
 
 def pose(image: ColmapImage) -> tuple[torch.Tensor, torch.Tensor]:
-    """(R [3,3], tau [3]) float32 of a registered image; NaN where the quaternion is zero or not finite."""
+    """(R [3,3], tau [3]) float64 of a registered image; NaN where the quaternion is zero or not finite."""
     q = np.array(image.qvec)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         q = q / np.abs(q).max()  # so that the squares neither overflow nor vanish
@@ -161,14 +197,13 @@ def pose(image: ColmapImage) -> tuple[torch.Tensor, torch.Tensor]:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-    return torch.from_numpy(R).float(), torch.tensor(image.tvec, dtype=torch.float64).float()
+    return torch.from_numpy(R), torch.tensor(image.tvec, dtype=torch.float64)
 
 
 def point_cloud(points: ColmapPoints) -> PointCloud:
-    """Points and colours of a model as float32."""
-    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is dropped as such
-        xyz = points.xyz.astype(np.float32)
-    return PointCloud(torch.from_numpy(xyz), torch.from_numpy(points.rgb.astype(np.float32) / 255))
+    """Points (float64) and colours (float32) of a model."""
+    rgb = torch.from_numpy(points.rgb.astype(np.float32) / 255)
+    return PointCloud(torch.from_numpy(points.xyz.astype(np.float64)), rgb)
 
 
 def mask_files(path: Path, names: Sequence[str]) -> list[Path | None]:
@@ -176,10 +211,11 @@ def mask_files(path: Path, names: Sequence[str]) -> list[Path | None]:
     folder = next((path / name for name in ("masks", "mask") if (path / name).is_dir()), None)
     if folder is None:
         return [None] * len(names)
+    there = {name_key(mask): folder / mask for mask in list_pictures(folder)}
     found: list[Path | None] = []
-    for name in names:
-        candidates = (folder / f"{name}.png", folder / name, (folder / name).with_suffix(".png"))
-        found.append(next((file for file in candidates if os.path.isfile(file)), None))
+    for name in map(name_key, names):
+        candidates = (f"{name}.png", name, f"{os.path.splitext(name)[0]}.png")
+        found.append(next((there[mask] for mask in candidates if mask in there), None))
     return found
 
 

@@ -20,9 +20,13 @@ from splatwizard_core.api import SceneError
 MODELS = {
     0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8),
     5: ("OPENCV_FISHEYE", 8), 6: ("FULL_OPENCV", 12), 7: ("FOV", 5), 8: ("SIMPLE_RADIAL_FISHEYE", 4),
-    9: ("RADIAL_FISHEYE", 5), 10: ("THIN_PRISM_FISHEYE", 12),
+    9: ("RADIAL_FISHEYE", 5), 10: ("THIN_PRISM_FISHEYE", 12), 11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    12: ("SIMPLE_DIVISION", 4), 13: ("DIVISION", 5), 14: ("SIMPLE_FISHEYE", 3), 15: ("FISHEYE", 4), 16: ("EUCM", 6),
+    17: ("EQUIRECTANGULAR", 2),
 }  # fmt: skip
-"""Model id -> (name, number of parameters)."""
+"""Model id -> (name, number of parameters), of COLMAP 4."""
+
+FEWEST_PARAMETERS = min(count for _, count in MODELS.values())
 
 MODEL_IDS = {name: (model_id, count) for model_id, (name, count) in MODELS.items()}
 
@@ -127,21 +131,42 @@ class _Bytes:
 
 
 def read_model(folder: Path) -> ColmapModel:
-    """The model in `folder`: the .bin files if there are any, else .txt.
+    """The model in `folder`: the .bin files if there are any, else .txt. Without points3D it has no points.
 
     Raises SceneError naming the missing file, or the damaged one with offset or line.
     """
-    paths = {}
+    paths: dict[str, Path | None] = {}
     for part in ("cameras", "images", "points3D"):
         found = [path for suffix in (".bin", ".txt") if (path := folder / (part + suffix)).is_file()]
-        if not found:
+        if not found and part != "points3D":
             raise SceneError(f"{folder}: {part}.bin (or .txt) is missing", path=str(folder))
-        paths[part] = found[0]
-    readers = {"cameras": read_cameras, "images": read_images, "points3D": read_points}
-    cameras = readers["cameras"](paths["cameras"])
-    images = readers["images"](paths["images"])
-    points = readers["points3D"](paths["points3D"])
-    return ColmapModel(cameras, images, points)  # type: ignore[arg-type]
+        paths[part] = found[0] if found else None
+    cameras, images = paths["cameras"], paths["images"]
+    assert cameras is not None
+    assert images is not None
+    points = no_points() if paths["points3D"] is None else read_points(paths["points3D"])
+    return ColmapModel(read_cameras(cameras), read_images(images), points)
+
+
+def no_points() -> ColmapPoints:
+    """The points of a model that has poses alone."""
+    return ColmapPoints(
+        np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), np.zeros(1, np.int64),
+        np.zeros((0, 2), np.int32),
+    )  # fmt: skip
+
+
+def count_images(folder: Path) -> int:
+    """The number of registered images that images.bin (or .txt) of a model claims; 0 where it cannot be read."""
+    try:
+        with (folder / "images.bin").open("rb") as file:
+            return int.from_bytes(file.read(8), "little")
+    except OSError:
+        pass
+    try:
+        return len(_text_lines(folder / "images.txt")) // 2
+    except SceneError:
+        return 0
 
 
 def read_cameras(path: Path) -> dict[int, ColmapCamera]:
@@ -153,7 +178,10 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
                 fields = line.split()
                 name = fields[1]
                 if name not in MODEL_IDS:
-                    raise SceneError(f"{path}, line {number}: unknown camera model '{name}'", path=str(path))
+                    raise SceneError(
+                        f"{path}, line {number}: unknown camera model '{name}', none of COLMAP's up to version 4",
+                        path=str(path),
+                    )
                 params = tuple(float(x) for x in fields[4:])
                 if len(params) != MODEL_IDS[name][1]:
                     raise ValueError(f"{name} has {MODEL_IDS[name][1]} parameters, not {len(params)}")
@@ -162,10 +190,13 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
             cameras[camera.id] = camera
         return cameras
     reader = _Bytes(path)
-    for i in range(reader.count("cameras", 24 + 3 * 8)):
+    for i in range(reader.count("cameras", 24 + 8 * FEWEST_PARAMETERS)):
         camera_id, model, width, height = reader.unpack("<iiQQ", f"camera {i}")
         if model not in MODELS:
-            reader.fail(f"unknown camera model {model} at byte {reader.at - 20}")
+            reader.fail(
+                f"unknown camera model {model} at byte {reader.at - 20}, none of COLMAP's up to version 4 "
+                f"(0 to {max(MODELS)})"
+            )
         name, n = MODELS[int(model)]
         params = reader.unpack(f"<{n}d", f"the parameters of camera {i}")
         _once(int(camera_id), cameras, "camera", str(path))

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from splatwizard_core.api import Scene, SceneError, SceneOptions
 from sw_datasets.loaders.colmap import load_colmap, mask_files, model_folder
-from sw_datasets.pictures import list_pictures
+from sw_datasets.picture_names import list_pictures
 from sw_datasets.rules import Rules
 from sw_datasets.zip_methods import check_method
 
@@ -40,6 +40,10 @@ def load_dtu(path: Path, rules: Rules, options: SceneOptions) -> Scene:
     scene = load_colmap(path, rules, options, masks=numbered_masks)
     views = {view.name: view for view in scene.train + scene.test}
     world, scale = read_alignments(path / CAMERAS, len(views))
+    if any(scene.origin):
+        back = torch.eye(4, dtype=torch.float64)
+        back[:3, 3] = torch.tensor(scene.origin, dtype=torch.float64)
+        scale = scale @ back  # from the scene's units about its local origin
     scene.ground_truth |= {"world_mats": world, "scale_mats": scale}
     centres = projection_centres(world @ scale)
     said = torch.stack([views[name].camera.center.double() for name in sorted(views)])

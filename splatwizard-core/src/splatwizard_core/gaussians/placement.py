@@ -1,0 +1,94 @@
+"""Where a model stands: about the local origin of a georeferenced scene, or in the world of the scene's files."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+import torch
+
+from splatwizard_core.errors import UserInputError
+from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.scene.scene import Scene
+
+log = logging.getLogger(__name__)
+
+AnyModel = TypeVar("AnyModel", bound=SplatModel)
+Origin = tuple[float, float, float]
+NOWHERE: Origin = (0.0, 0.0, 0.0)
+WORLD_ORIGIN = "world_origin"
+"""Key of a model's `origin`, and of a file's header: where the origin of its coordinates lies in the world."""
+
+AS_WORLD = "as_world"
+"""Key of a model's `origin`: whoever writes it next adds the world's origin to its coordinates."""
+
+
+def origin_of(model: SplatModel) -> Origin | None:
+    """Where the origin of a model's coordinates lies in the world, as its file says; None where it does not say."""
+    return as_origin(getattr(model, "origin", {}).get(WORLD_ORIGIN))
+
+
+def as_origin(value: Any) -> Origin | None:
+    """Three finite numbers of a file as an origin; None for anything else."""
+    numbers = isinstance(value, Sequence) and len(value) == 3 and all(type(x) in (int, float) for x in value)
+    if not numbers or not all(math.isfinite(x) for x in value):
+        return None
+    x, y, z = value
+    return (float(x), float(y), float(z))
+
+
+def with_origin(model: SplatModel, origin: Origin) -> None:
+    """Note where the origin of a model's coordinates lies, for the next file; nothing for 0."""
+    if isinstance(model, GaussianModel) and any(origin):
+        model.origin = {**model.origin, WORLD_ORIGIN: list(origin)}
+
+
+def placed_in(model: AnyModel, scene: Scene, name: str = "the model") -> AnyModel:
+    """The model, moved in place to the origin of a scene.
+
+    A model whose file does not say where it stands is taken to be in the world of the scene's files if it lies nearer
+    to the scene there than about the local origin, and that is told.
+
+    name    of the file, for the message
+    """
+    if not isinstance(model, GaussianModel) or not model.num_rows:
+        return model
+    here = torch.tensor(scene.origin, dtype=torch.float64)
+    told = origin_of(model)
+    if told is not None:
+        shift = torch.tensor(told, dtype=torch.float64) - here
+    elif any(scene.origin):
+        middle = model.means.detach().double().cpu().median(dim=0).values
+        if (middle - here).norm() >= middle.norm():
+            return model
+        shift = -here
+        log.warning("%s: it stands in the world of the scene's files and is moved to the scene's local origin", name)
+    else:
+        return model
+    if bool(shift.any()):
+        with torch.no_grad():
+            model.means.copy_(model.means.double() + shift.to(model.device))
+    model.origin = {**model.origin, WORLD_ORIGIN: list(scene.origin)}
+    return model
+
+
+def in_world(model: SplatModel, name: str) -> SplatModel:
+    """The model, asked of the next exporter in the coordinates of the world: `origin` says `as_world`.
+
+    One that can hold doubles adds the world's origin in double precision, others do in float32 (`world_shift`).
+    Raises UserInputError where the file does not say where its origin lies.
+    """
+    if origin_of(model) is None or not isinstance(model, GaussianModel):
+        raise UserInputError(
+            f"--world: {name} does not say where its origin lies: its scene was not moved, or another program wrote it"
+        )
+    model.origin = {**model.origin, AS_WORLD: True}
+    return model
+
+
+def world_shift(model: SplatModel) -> Origin | None:
+    """What an exporter adds to the coordinates: the world's origin, if world coordinates are asked for."""
+    return origin_of(model) if getattr(model, "origin", {}).get(AS_WORLD) else None
