@@ -79,7 +79,7 @@ def test_a_room_is_small_enough_to_follow(room):
 
 def test_core_and_native_together_stay_small():
     lines = lines_of(files_of(CORE)) + lines_of(files_of(NATIVE))
-    assert lines < 15_200, f"core and native have {lines:,} lines"
+    assert lines < 15_400, f"core and native have {lines:,} lines"
 
 
 @pytest.mark.parametrize("room", sorted(ROOMS))

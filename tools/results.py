@@ -26,7 +26,7 @@ import result_claims
 import result_plots
 import result_published
 import trainer_records
-from result_groups import BASE, NONE, TITLES, Rows, points, rate, smaller, spread, title
+from result_groups import NONE, TITLES, Rows, points, rate, smaller, spread, title
 from result_records import FROM, MIB, RECORDS, ROOT, extract, merged, read, write
 
 from splatwizard_core.tooling import load_plugins
@@ -99,17 +99,6 @@ def needs_table(records: Rows) -> list[list[str]]:
     return rows
 
 
-def brief_table(records: Rows) -> list[list[str]]:
-    """Default rate points, and every file of 3DGS, for a first look."""
-    rows = [["method", "rate", "PSNR, dB", "bytes", "x", "Gaussians", "n"]]
-    rows += [
-        [title(g), rate(g), spread([r.psnr for r in g], 2), spread([r.bytes for r in g], 0),
-         spread(smaller(g, records), 1), spread([r.gaussians for r in g], 0), str(len(g))]
-        for g in points(records) if g[0].default_rate or g[0].method == BASE
-    ]  # fmt: skip
-    return rows
-
-
 def formats_table(records: Rows) -> list[list[str]]:
     """Files of one scene, the smallest first: what each holds, from which training, and its seconds."""
     rows = [["method", "rate", "bytes", "x", "PSNR dB", "SSIM", "Gaussians", "starts from", "taught by", "steps",
@@ -158,7 +147,7 @@ def started_by(group: Rows) -> str:
 
 
 TABLES: dict[str, Callable[[Rows], list[list[str]]]] = {
-    "quality": quality_table, "cost": cost_table, "brief": brief_table, "formats": formats_table,
+    "quality": quality_table, "cost": cost_table, "formats": formats_table,
     "starts": starts_table, "needs": needs_table,
 }  # fmt: skip
 
