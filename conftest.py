@@ -53,3 +53,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     first = {config.rootpath / name: place for place, name in enumerate(LONG_FIRST)}
     assert all(map(Path.is_file, first)), "LONG_FIRST names a file that is gone"
     items.sort(key=lambda item: first.get(item.path, len(first)))
+
+
+@pytest.fixture
+def advice_as_installed() -> None:
+    """Let messages tell how to install from this checkout; elsewhere tests read them as they are written."""
+
+
+@pytest.fixture(autouse=True)
+def _advice_as_written(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    if "advice_as_installed" not in request.fixturenames:
+        monkeypatch.setattr("splatwizard_core.plugins.remedies._local", lambda found: found[0])

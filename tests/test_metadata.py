@@ -50,3 +50,16 @@ def test_the_citation_is_of_this_version_and_licence():
     assert fields["version"] == __version__
     assert fields["license"] == "MIT"
     assert re.search(r"^authors:\n  - name: \S", CITATION, re.M)
+
+
+def test_the_bibtex_of_the_docs_is_what_the_citation_says():
+    page = (ROOT / "docs" / "questions.md").read_text("utf-8")
+    software, paper = re.findall(r"@\w+\{[\w-]+,\n(.*?)\n\}", page, re.S)
+    fields = dict(re.findall(r'^([a-z-]+): "?([^"\n]+)"?$', CITATION, re.M))
+    told = dict(re.findall(r"(\w+) += \{+([^{}]+)\}+", software))
+    assert (told["title"], told["version"], told["date"], told["license"]) == (
+        fields["title"], fields["version"], fields["date-released"], fields["license"]
+    )  # fmt: skip
+    assert f"name: {told['author']}\n" in CITATION
+    eprint = dict(re.findall(r"(\w+) += \{+([^{}]+)\}+", paper))["eprint"]
+    assert f"arXiv:{eprint}" in CITATION

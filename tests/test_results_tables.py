@@ -38,7 +38,7 @@ def test_every_table_is_what_its_records_say(tools):
 
 def test_a_table_that_was_changed_by_hand_is_found(tools):
     page = tools.PAGES[1].read_text("utf-8")
-    changed = re.sub(r"(<!-- table brief demo -->.*?)\d\d\.\d\d", r"\g<1>99.99", page, count=1, flags=re.S)
+    changed = re.sub(r"(<!-- table published-brief chair -->.*?)\d\d\.\d\d", r"\g<1>99.99", page, count=1, flags=re.S)
     assert changed != page
     assert tools.filled(changed) == page
 
@@ -276,6 +276,6 @@ def test_what_the_matrix_measured_alone_counts(tools, tmp_path):
 def test_a_line_that_is_no_record_is_named(tools, tmp_path):
     (tmp_path / "x.jsonl").write_text('{"method": "3dgs"}\n')
     with pytest.raises(SystemExit, match="line 1"):
-        tools.table("brief", "x", tmp_path)
+        tools.table("cost", "x", tmp_path)
     with pytest.raises(SystemExit, match="no table is called"):
         tools.table("other", "x", tmp_path)

@@ -2,11 +2,13 @@
 
 import importlib.metadata
 import json
+import re
 import struct
 import zlib
 from pathlib import Path
 
 import pytest
+from advice import as_written
 from sw_kit.hostile_files import Parts
 
 from splatwizard_core.cli.main import main
@@ -202,7 +204,10 @@ def test_really_missing_packages(core, wheels, tmp_path):
     assert "positions" in core.run("info", str(path)).stdout
     done = core.run("decode", str(path), check=False)
     assert done.returncode == 2
-    assert "pip install 'sw-3dgs>=0.1.0' (the package that the file names)" in done.stderr
+    assert "pip install 'sw-3dgs>=0.1.0' (the package that the file names)" in as_written(done.stderr)
+    command = re.search(r"(\S+ (?:-m pip )?install --find-links \S+ '[^']+')", done.stderr)
+    assert command is not None
+    assert Path(re.search(r"--find-links (\S+)", command[1])[1]) == wheels["sw-3dgs"].parent
     core.install(wheels["sw-3dgs"])
     done = core.run("decode", str(path), check=False)
     assert done.returncode == 2

@@ -1,4 +1,4 @@
-"""Make every table and plot of measured runs in README.md, docs/results.md and docs/formats.md from docs/records.
+"""Make every table and plot of measured runs in README.md and the pages of docs from docs/records.
 
     python tools/results.py collect OUT...       # records of all runs under OUT into docs/records, then what follows
     python tools/results.py tables               # the tables and plots alone
@@ -26,12 +26,12 @@ import result_claims
 import result_plots
 import result_published
 import trainer_records
-from result_groups import BASE, NONE, TITLES, Rows, points, rate, smaller, spread, title
+from result_groups import NONE, TITLES, Rows, points, rate, smaller, spread, title
 from result_records import FROM, MIB, RECORDS, ROOT, extract, merged, read, write
 
 from splatwizard_core.tooling import load_plugins
 
-PAGES = (ROOT / "docs" / "results.md", ROOT / "README.md", ROOT / "docs" / "formats.md")
+PAGES = tuple(ROOT / page for page in ("docs/results.md", "README.md", "docs/formats.md", "docs/questions.md"))
 MARKED = re.compile(r"(<!-- (?:table|(?=plot)) ?(\w[\w-]*) (\w[\w.-]*) -->\n).*?(<!-- end -->)", re.S)
 
 
@@ -72,14 +72,30 @@ def cost_table(records: Rows) -> list[list[str]]:
     return rows
 
 
-def brief_table(records: Rows) -> list[list[str]]:
-    """Default rate points, and every file of 3DGS, for a first look."""
-    rows = [["method", "rate", "PSNR, dB", "bytes", "x", "Gaussians", "n"]]
-    rows += [
-        [title(g), rate(g), spread([r.psnr for r in g], 2), spread([r.bytes for r in g], 0),
-         spread(smaller(g, records), 1), spread([r.gaussians for r in g], 0), str(len(g))]
-        for g in points(records) if g[0].default_rate or g[0].method == BASE
-    ]  # fmt: skip
+def needs_table(records: Rows) -> list[list[str]]:
+    """Memory and seconds of trainings on a GPU, by method and size of the result, the smallest memory first."""
+    rows = [
+        [
+            "method",
+            "rate",
+            "Gaussians",
+            "anchors",
+            "training, MiB",
+            "rendering, MiB",
+            "training, s",
+            "its start, s",
+            "n",
+        ]
+    ]
+    groups = [g for g in points([r for r in records if r.default_rate]) if any(r.train_bytes for r in g)]
+    for group in sorted(groups, key=lambda g: statistics.fmean(r.train_bytes for r in g if r.train_bytes)):
+        timed = [r for r in group if r.alone] or group
+        rows.append([
+            title(group), rate(group), spread([r.gaussians for r in group], 0), spread([r.anchors for r in group], 0),
+            spread([None if r.train_bytes is None else r.train_bytes / MIB for r in group], 0),
+            spread([r.render_bytes / MIB for r in group], 0),
+            spread([r.train_s for r in timed], 0), spread([r.start_s for r in timed], 0), str(len(group)),
+        ])  # fmt: skip
     return rows
 
 
@@ -131,8 +147,8 @@ def started_by(group: Rows) -> str:
 
 
 TABLES: dict[str, Callable[[Rows], list[list[str]]]] = {
-    "quality": quality_table, "cost": cost_table, "brief": brief_table, "formats": formats_table,
-    "starts": starts_table,
+    "quality": quality_table, "cost": cost_table, "formats": formats_table,
+    "starts": starts_table, "needs": needs_table,
 }  # fmt: skip
 
 

@@ -100,9 +100,10 @@ def test_the_command_lines_of_a_build(package, monkeypatch, tmp_path, march):
             Path(command[-1]).with_name(f"{Path(command[-1]).name}.d").write_text(f"x: {package.folder}/value.h\n")
         else:
             Path(command[command.index("-o") + 1] if "-o" in command else tmp_path / "asked").write_text("library")
-        return subprocess.CompletedProcess(command, 0, b"" if command[-1] != "--version" else "g++ 99\n", "")
+        return subprocess.CompletedProcess(command, 0, "g++ 99\n", "")
 
     monkeypatch.setattr(toolchain.subprocess, "run", compiler)
+    monkeypatch.setattr(toolchain.Compilers, "run", lambda _, command, log: compiler(command))
     library = module.build(march=march, tools=toolchain.Toolchain(1))
     link = run.pop()
     scratch = Path(link[link.index("-o") + 1]).parent

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from sw_bench.cells import Layout, cells_of, jobs_of, prepare, run_job
+from sw_bench.cells import Layout, cells_of, differing_bases, jobs_of, prepare, run_job
 from sw_bench.estimates import Estimates
 from sw_bench.plan import checked_plan
 from sw_bench.probe import probe_into
@@ -113,6 +113,45 @@ def test_keys_of_trained_scenes_are_for_the_methods_that_start_from_one(tmp_path
     assert ["pretrained.iterations=20" in cell.words for cell in cells] == [False, True]
     with pytest.raises(ConfigError, match="3dgs on demo:tiny: method '3dgs' does not start from a trained scene"):
         planned(tmp_path, methods=["3dgs"], set={}, method={"3dgs": {"set": {"pretrained.iterations": 5}}})
+
+
+def test_what_a_plan_says_of_all_methods_also_trains_what_they_start_from(tmp_path, capsys):
+    cells, jobs, _ = planned(tmp_path, methods=["3dgs", "lightgaussian"], set={"iterations": 20})
+    assert dict(cells[1].resolved.pretrained) == {"iterations": 20}
+    assert [job.shared is not None for job in jobs] == [True, False, False]  # 3dgs itself is that scene
+    assert not differing_bases(cells, load_plugins())
+    assert (
+        "lightgaussian: the trained scene that it starts from has pretrained.iterations=20" in capsys.readouterr().err
+    )
+
+
+@pytest.mark.parametrize("where", ["scene", "override"])
+def test_so_does_what_is_said_of_all_methods_on_one_scene(where, tmp_path):
+    values = {"set": {"iterations": 20}}
+    table = {"demo:tiny": values} if where == "scene" else [{"scenes": ["demo:tiny"], **values}]
+    cells, _, _ = planned(tmp_path, methods=["3dgs", "lightgaussian"], set={}, **{where: table})
+    assert dict(cells[1].resolved.pretrained) == {"iterations": 20}
+
+
+def test_what_is_said_of_one_method_or_only_encodes_trains_nothing_else(tmp_path):
+    own = {"lightgaussian": {"set": {"iterations": 20}}}
+    cells, _, _ = planned(tmp_path, methods=["3dgs", "lightgaussian"], set={}, method=own)
+    assert not cells[1].resolved.pretrained
+    (cell,), _, _ = planned(tmp_path, methods=["lightgaussian"], set={"iterations": 20})
+    assert not cell.resolved.pretrained
+    cells, _, _ = planned(tmp_path, methods=["3dgs", "spz"], set={"codec": "gaussians-exact"})
+    assert not cells[1].resolved.pretrained
+
+
+def test_runs_that_start_from_differently_trained_scenes_are_told(tmp_path):
+    own = {"3dgs": {"set": {"iterations": 20}}}
+    cells, _, _ = planned(tmp_path, methods=["3dgs", "lightgaussian"], set={}, preset="paper", method=own)
+    assert differing_bases(cells, load_plugins()) == [
+        "demo:tiny: the trained 3dgs scenes differ: iterations=30000 for lightgaussian; iterations=20 for 3dgs"
+    ]
+    variants = {"a": {"method": "3dgs", "set": {"iterations": 20}}}
+    cells, _, _ = planned(tmp_path, methods=["3dgs", "a"], set={}, method=variants)
+    assert not differing_bases(cells, load_plugins())  # they differ on purpose
 
 
 def test_the_same_values_make_the_same_run_and_only_those(tmp_path):

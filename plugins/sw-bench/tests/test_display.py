@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 from sw_bench import display
 from sw_bench.cells import Cell, run_job
-from sw_bench.display import LiveTable
+from sw_bench.display import Lines, LiveTable
 from sw_bench.estimates import Estimates
 
 
@@ -67,6 +67,25 @@ def test_a_failure_is_counted_and_printed_above(sweep):
     shown.ended(sweep, sweep.jobs[1], "failed", "no memory", 3.0)
     assert "0/1 1 failed" in text(shown, sweep)
     assert "no memory" in shown._console.file.getvalue()
+
+
+def test_without_a_terminal_it_says_every_half_minute_what_runs(sweep, monkeypatch, capsys):
+    clock = SimpleNamespace(now=100.0)
+    monkeypatch.setattr(display, "time", SimpleNamespace(monotonic=lambda: clock.now))
+    shown = Lines(sweep.cells, sweep.cells[:1], Estimates([("b", "x/garden", 100.0)]))
+    for clock.now in (101.0, 129.0, 130.0, 131.0, 159.0, 160.5):
+        shown.tick(sweep)
+    first, second = capsys.readouterr().err.splitlines()
+    assert first.startswith("[1/3] running   b x/garden seed 0 r1, 1 min 40 s · about ")
+    assert second.startswith("[1/3] running   b x/garden seed 0 r1, 2 min 10 s")
+    shown.started(sweep, sweep.jobs[1])
+    capsys.readouterr()
+    clock.now += 29  # since the last line of any kind
+    shown.tick(sweep)
+    sweep.running = {}
+    clock.now += 60
+    shown.tick(sweep)
+    assert not capsys.readouterr().err
 
 
 @pytest.mark.parametrize("width", [40, 80, 200])

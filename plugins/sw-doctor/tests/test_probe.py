@@ -70,7 +70,7 @@ def kernels(tmp_path, monkeypatch) -> NativeModule:
 def test_kernels_that_are_not_built_are_missing_and_stay_so(kernels, tmp_path):
     found = probe.check_kernels("doctored_kernels:MODULE")
     assert (found.state, found.mend) == ("missing", "sw build-kernels")
-    assert "about 7 s" in found.detail
+    assert "about" not in found.detail  # nothing was measured here so far
     assert "it is slow" in found.detail
     assert not (tmp_path / "cache").exists()
 

@@ -8,10 +8,11 @@ import sys
 from pathlib import Path
 
 import pytest
+from sw_geometry.command import _target
 from sw_geometry.open3d_import import import_open3d
 from sw_geometry.ply import read_mesh
 
-from splatwizard_core.api import CapabilityError
+from splatwizard_core.api import CapabilityError, UserInputError
 from splatwizard_core.cli.main import main
 
 ROOT = Path(__file__).parents[3]
@@ -126,3 +127,27 @@ def test_a_scene_without_truth_cannot_be_measured(run, capsys, monkeypatch):
     monkeypatch.setattr("sw_geometry.chamfer.Truth.of", lambda scene: None)
     assert main(["mesh", str(run), *COARSE, "--chamfer"]) == 2
     assert "brings no surface to compare with" in capsys.readouterr().err
+
+
+def test_a_file_for_the_mesh_is_written_and_nothing_else(run, open3d, tmp_path, capsys):
+    target = tmp_path / "surface.ply"
+    assert main(["mesh", str(run), *COARSE, "--out", str(target), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert (facts["folder"], facts["files"]) == (str(tmp_path), ["surface.ply"])
+    assert facts["triangles_post"] == len(read_mesh(target))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["r3", "surface.ply"]
+    assert not (run / "mesh").exists()
+
+
+def test_a_file_is_told_from_a_folder_by_its_suffix(tmp_path):
+    (tmp_path / "old.ply").mkdir()
+    for name in ("mesh", "old.ply"):  # as earlier releases made one
+        assert _target(None, None, str(tmp_path / name)) == tmp_path / name
+    assert _target(None, None, str(tmp_path / "new.ply")) == tmp_path / "new.ply"
+    with pytest.raises(UserInputError, match="there is no folder"):
+        _target(None, None, str(tmp_path / "none" / "new.ply"))
+
+
+def test_a_file_in_a_folder_that_is_not_there_is_refused_before_the_work(run, tmp_path, capsys):
+    assert main(["mesh", str(run), "--out", str(tmp_path / "none" / "surface.ply")]) == 2
+    assert "there is no folder" in capsys.readouterr().err

@@ -52,9 +52,10 @@ def register_datasets(registry: Any) -> None:
 
 @hookimpl
 def register_methods(registry: Any) -> None:
-    for name, rank in (("hac", 1), ("lightgaussian", 2), ("3dgs", 3)):
+    registry.add("hac-plus", "nowhere:method", title="HAC++", summary="")
+    for name, rank, title in (("hac", 1, "HAC"), ("lightgaussian", 2, "LightGaussian"), ("3dgs", 3, "3DGS")):
         declared = {"published": "published_example:hac.toml"} if name == "hac" else {}
-        registry.add(name, "nowhere:method", summary="", bd_anchor=rank, **declared)
+        registry.add(name, "nowhere:method", title=title, summary="", bd_anchor=rank, **declared)
     registry.add("another", "nowhere:method", summary="")
 
 

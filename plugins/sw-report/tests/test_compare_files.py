@@ -77,6 +77,52 @@ def test_another_order_and_equal_rotations_make_no_error():
     assert found.unpaired == 0.5
 
 
+def with_axes(model: GaussianModel, order: list[int], turn: float = 0.0) -> GaussianModel:
+    """The ellipsoids with their axes in another order (an even one), turned by an angle about the new last axis."""
+    w, x, y, z = model.quats.detach().double().unbind(1)
+    quarter = torch.tensor({(1, 2, 0): [0.5, 0.5, 0.5, 0.5], (0, 1, 2): [1.0, 0, 0, 0]}[tuple(order)]).double()
+    half = torch.tensor([np.cos(turn / 2), 0, 0, np.sin(turn / 2)]).double()
+
+    def times(a, b):
+        aw, ax, ay, az = a
+        bw, bx, by, bz = b
+        return (aw * bw - ax * bx - ay * by - az * bz, aw * bx + ax * bw + ay * bz - az * by,
+                aw * by - ax * bz + ay * bw + az * bx, aw * bz + ax * by - ay * bx + az * bw)  # fmt: skip
+
+    found = changed(model)
+    with torch.no_grad():
+        found.quats.copy_(torch.stack(times(times((w, x, y, z), quarter), half), dim=1))
+        found.log_scales.copy_(model.log_scales[:, order])
+    return found
+
+
+def test_axes_in_another_order_are_the_same_ellipsoid():
+    a = model_of()
+    b = with_axes(a, [1, 2, 0])
+    assert float((a.log_scales - b.log_scales).detach().abs().max()) > 0.1
+    found = attribute_errors(a, b)
+    assert found is not None
+    assert found.errors["covariance"].max < 1e-5  # it is the same one
+    assert found.errors["log_scale"].max < 1e-6
+    assert found.errors["rotation"].max < 0.05  # degrees: an angle of float32 axes is known to 1e-4 radians
+
+
+def test_a_turned_ellipsoid_has_its_angle_and_a_sphere_none():
+    a = model_of()
+    with torch.no_grad():
+        a.log_scales.copy_(torch.tensor([-1.0, -3.0, -5.0]).expand(200, 3))
+    found = attribute_errors(a, with_axes(a, [0, 1, 2], np.radians(7)))
+    assert found is not None
+    assert found.errors["rotation"].rms == pytest.approx(7, abs=0.05)
+    assert found.errors["log_scale"].max < 1e-6
+    with torch.no_grad():
+        a.log_scales.fill_(-2.0)
+    found = attribute_errors(a, with_axes(a, [0, 1, 2], np.radians(7)))
+    assert found is not None
+    assert found.errors["rotation"].max == 0
+    assert found.errors["covariance"].max < 1e-6
+
+
 def test_what_is_not_finite_is_left_out_and_surfels_are_flat():
     a, b = model_of(), model_of()
     with torch.no_grad():

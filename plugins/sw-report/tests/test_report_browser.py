@@ -44,6 +44,21 @@ OVERFLOW = """
 """
 
 
+# Words of the heads of tables that stand on more than one line.
+BROKEN = """
+[...document.querySelectorAll('thead th')].flatMap(th => {
+  const walker = document.createTreeWalker(th, NodeFilter.SHOW_TEXT), found = [];
+  for (let node; (node = walker.nextNode());) for (const word of node.data.matchAll(/\\S+/g)) {
+    const range = document.createRange();
+    range.setStart(node, word.index);
+    range.setEnd(node, word.index + word[0].length);
+    if (new Set([...range.getClientRects()].map(box => Math.round(box.top))).size > 1) found.push(word[0]);
+  }
+  return found;
+})
+"""
+
+
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory):
     found = Chromium(find_chromium(), tmp_path_factory.mktemp("profile"))
@@ -72,6 +87,7 @@ def test_the_page_fits_is_readable_and_asks_for_nothing(browser, pages, tmp_path
         browser.picture(tmp_path / f"{page.stem}-{width}-{scheme}.png")
         assert browser.ask("document.documentElement.scrollWidth") == width
         assert browser.ask(OVERFLOW) == []
+        assert browser.ask(BROKEN) == []
         assert browser.ask(CONTRAST) == []
         assert browser.requests() == [page.resolve().as_uri()]
         assert browser.complaints() == []

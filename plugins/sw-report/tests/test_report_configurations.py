@@ -239,7 +239,7 @@ def test_the_page_about_the_seeds_of_one_rate_point_shows_their_mean(make, tmp_p
     assert collection.notes == [OF_SEEDS]
     text = render_page(collection, PageOptions(pictures=False))
     (run,) = collection.runs
-    assert f"{run.mean('psnr'):.2f} ± {run.deviation('psnr'):.2f}" in text
+    assert f"{run.mean('psnr'):.2f} ±\N{NO-BREAK SPACE}{run.deviation('psnr'):.2f}" in text
     assert "2 runs: 1 method on 1 scene" in text
     assert text.count("sw run --method toy --scene garden --preset paper --rate r1") == 2
 

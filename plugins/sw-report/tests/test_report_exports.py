@@ -8,7 +8,9 @@ import re
 import pytest
 from sw_report import exports
 from sw_report.latex import methods_by_datasets, to_latex
+from sw_report.results_tables import runs_table
 from sw_report.runs import collect
+from sw_report.selection import PAPER, selected
 
 from splatwizard_core.cli.main import main
 
@@ -99,6 +101,62 @@ def test_latex_has_bold_bests_labels_and_no_advice(make_curve, tmp_path):
     assert text.count(r"\textbf{") == 5  # PSNR and SSIM of both r4, which are equal; the smallest file; FPS are equal
     assert "pip" not in text
     assert "LPIPS (VGG): weights-missing" in text
+    paper = [(title, selected(table, PAPER)) for title, table in tables]
+    assert "weights-missing" not in to_latex(paper, [], collection.runs)  # of a column that is not there
+
+
+def test_latex_has_six_columns_arrows_and_names_as_published(make_curve, tmp_path, capsys):
+    def with_lpips(content):
+        for name, value in (("lpips_vgg_3dgs", 0.25), ("lpips_alex", 0.125)):
+            content["metrics"][name] = {"mean": value, "per_view": [], "direction": "lower"}
+
+    make_curve("hac-plus", change=with_lpips)
+    make_curve("3dgs", 2.0, change=with_lpips)
+    assert main(["report", str(tmp_path), "--latex"]) == 0
+    head, *rows = [line.strip() for line in capsys.readouterr().out.splitlines() if line.endswith(r" \\")][:9]
+    assert head.count("&") == 5
+    for name, arrow in (("PSNR dB", "up"), ("SSIM", "up"), ("LPIPS (VGG, 3DGS)", "down"), ("MB", "down")):
+        assert rf"{name} $\{arrow}arrow$" in head
+    assert "0.125" not in rows[0]
+    assert [row.split(" & ")[0] for row in rows] == ["3DGS"] * 4 + ["HAC++"] * 4
+
+
+def test_columns_are_chosen_in_order_for_every_table(make_curve, tmp_path, capsys):
+    make_curve("toy", scene="a")
+    make_curve("toy", scene="b")
+    assert main(["report", str(tmp_path), "--markdown", "--columns", "size,rate,scenes"]) == 0
+    heads = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| method")]
+    assert heads == ["| method | MB | rate |", "| method | MB | rate |", "| method | MB | rate | scenes |"]
+    assert main(["report", str(tmp_path), "--columns", "size,psrn"]) == 2
+    assert "--columns has no 'psrn': one or more of" in capsys.readouterr().err
+    assert main(["report", str(tmp_path), "--columns", "size", "--csv"]) == 2
+
+
+def test_notes_are_about_the_columns_that_are_shown(make_run, tmp_path):
+    make_run(change=lambda content: content.update(contended={"train": 0.5}))
+    table = runs_table(collect([tmp_path]).runs)
+    assert any("Other processes" in note for note in selected(table, None).notes)
+    assert any("Other processes" in note for note in selected(table, ["train"]).notes)
+    assert not any("Other processes" in note for note in selected(table, PAPER).notes)
+
+
+def test_rate_points_stand_in_their_order_whatever_their_sizes(make_run, tmp_path):
+    sizes = {"r1": 5000, "r2": 1000, "r10": 2000}
+    for rate, size in sizes.items():
+        make_run(rate, size=size)
+    assert [run.facts.rate for run in collect([tmp_path]).runs] == list(sizes)
+
+
+def test_an_anchor_that_compares_with_nothing_says_why(make_curve, make_run, tmp_path, capsys):
+    make_curve("3dgs")
+    make_curve("hac", change=lambda c: c["metrics"]["psnr"].update(mean=c["metrics"]["psnr"]["mean"] - 30))
+    make_run("r1", method="toy")
+    assert main(["report", str(tmp_path), "--anchor", "toy", "--csv"]) == 0
+    told = capsys.readouterr().err
+    assert "--anchor toy: No BD values by PSNR, SSIM: a curve needs at least 2 points, that of toy has 1." in told
+    assert re.search(r"garden: PSNR dB of 3dgs [\d.]+ to [\d.]+, hac -?[\d.]+ to [\d.]+, toy ", told)
+    assert main(["report", str(tmp_path), "--anchor", "3dgs", "--csv"]) == 0
+    assert "--anchor" not in capsys.readouterr().err
 
 
 def test_latex_of_several_data_sets_begins_with_methods_by_data_sets(make_run, tmp_path):
@@ -111,7 +169,7 @@ def test_latex_of_several_data_sets_begins_with_methods_by_data_sets(make_run, t
     assert first.count(r"\multicolumn{3}{c}") == 3  # PSNR, SSIM, MB
     assert r"\multicolumn{3}{c}{theirs}" in first
     assert r"\multicolumn{3}{c}{train}" in first  # the other scene of its data set is missing: no mean
-    lines = [line for line in first.splitlines() if line.strip().startswith(("toy", "3dgs"))]
+    lines = [line for line in first.splitlines() if line.strip().startswith(("toy", "3DGS"))]
     assert len(lines) == 2
     assert all(len(re.findall(r"(?<!\\)&", line)) == 10 for line in lines)
     assert lines[0].count(r"\textbf{") == 6

@@ -15,7 +15,7 @@ def test_runs_are_found_at_any_depth_once_and_in_order(make_run, tmp_path):
         make_run(rate, scene=scene, method=method, size=size * 1000)
     found = collect([tmp_path, tmp_path / "out" / "scan9"]).runs
     assert [(r.facts.scene, r.label) for r in found] == [
-        ("scan9", "hac r1"), ("scan9", "toy r2"), ("scan9", "toy r1"), ("scan10", "toy r1"),
+        ("scan9", "hac r1"), ("scan9", "toy r1"), ("scan9", "toy r2"), ("scan10", "toy r1"),
     ]  # fmt: skip
 
 

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import html
 import json
 import re
+import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
+import sw_viewer
 import torch
 from sw_gaussians.ply import export_ply
 from sw_viewer.page_file import About, write_page
@@ -93,6 +97,45 @@ def test_the_method_and_the_bytes_of_a_file_are_told(tmp_path):
     assert f"<span>{file.stat().st_size:,} bytes encoded</span>" in text
 
 
+def test_two_models_stand_in_one_page_and_are_seen_from_the_same_cameras(tmp_path, monkeypatch):
+    monkeypatch.chdir(GOLDEN)
+    page = tmp_path / "pair.html"
+    assert main(["view", "3dgs_r1_v1.swz", "3dgs_r3_v1.swz", "--html", str(page)]) == 0
+    frames = re.findall(r'<iframe title="([^"]*)" srcdoc="([^"]*)"></iframe>', page.read_text("utf-8"))
+    assert [title for title, _ in frames] == ["3dgs_r1_v1.swz", "3dgs_r3_v1.swz"]
+    facts = []
+    for i, (title, text) in enumerate(frames):
+        single = tmp_path / f"{i}.html"
+        single.write_text(html.unescape(text), "utf-8")
+        facts.append(facts_of(single))
+        size = (GOLDEN / title).stat().st_size
+        assert f"<span>{size:,} bytes encoded</span>" in single.read_text("utf-8")
+        assert "<h1>" + title + "</h1>" in single.read_text("utf-8")
+    assert facts[0]["cameras"] == facts[1]["cameras"]
+    assert "http" not in re.sub(r"srcdoc=\"[^\"]*\"", "", page.read_text("utf-8"))  # it loads nothing
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="needs node")
+def test_an_eye_goes_where_another_one_is():
+    script = (
+        (Path(sw_viewer.__file__).parent / "page" / "camera.js").read_text("utf-8")
+        + """
+    const camera = { width: 4, height: 3, fx: 1, fy: 1, cx: 2, cy: 1.5, R: [1,0,0, 0,1,0, 0,0,1], tau: [0,0,2] };
+    const facts = { up: [0,-1,0], pivot: [0,0,0], size: 1, cameras: [camera] };
+    let changes = 0;
+    const [one, two] = [new Eye(facts, () => {}), new Eye(facts, () => { changes += 1; })];
+    one.turn(0.3, 0.1); one.move(0.1, 0, 0.2);
+    two.take(JSON.parse(JSON.stringify(one.place)));
+    console.log(JSON.stringify([one.pose, two.pose, one.lens(8, 6), two.lens(8, 6), changes]));
+    """
+    )
+    done = subprocess.run(["node", "-e", script], capture_output=True, text=True, check=True)
+    pose, same, lens, same_lens, changes = json.loads(done.stdout)
+    assert pose == same
+    assert lens == same_lens
+    assert changes == 2  # its own first place, and this one
+
+
 def test_what_cannot_be_a_page_is_refused_and_nothing_is_left(tmp_path, capsys):
     (anchors,) = GOLDEN.glob("hac_exact_v2.swz")
     assert main(["export", str(anchors), str(tmp_path / "new.html")]) == 2
@@ -100,9 +143,9 @@ def test_what_cannot_be_a_page_is_refused_and_nothing_is_left(tmp_path, capsys):
     (tmp_path / "runs").mkdir()
     assert main(["view", str(tmp_path / "runs"), "--html", str(tmp_path / "new.html")]) == 2
     assert "holds no finished run" in capsys.readouterr().err
-    two = [str(GOLDEN / name) for name in ("3dgs_r3_v1.swz", "3dgs_r2_v1.swz")]
-    assert main(["view", *two, "--html", str(tmp_path / "new.html")]) == 2
-    assert "writes one model, here are 2" in capsys.readouterr().err
+    three = [str(GOLDEN / f"3dgs_r{n}_v1.swz") for n in (1, 2, 3)]
+    assert main(["view", *three, "--html", str(tmp_path / "new.html")]) == 2
+    assert "writes one model or two side by side, here are 3" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["runs"]
 
 

@@ -69,7 +69,9 @@ def evaluate(source: Opened | str | Path, scene: str | None = None, *, speed: bo
     """Measure a file, or what `decode` and `train` return, on the test views: the facts of `sw eval --json`."""
     if isinstance(source, Opened):
         options.setdefault("device", source.model.device.type)
-    session, resolved = _session(options, scene)
+    chosen = _choices(options, scene=scene)
+    resolved = (chosen if isinstance(source, Opened) else chosen.of_file(Path(source))).resolve_without_method()
+    session = tooling.open_session(resolved, tooling.load_plugins())
     open_it = (lambda: source) if isinstance(source, Opened) else opener(Path(source), session)
     return measure(session, resolved, open_it, speed=speed)
 

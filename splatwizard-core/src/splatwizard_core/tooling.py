@@ -19,7 +19,7 @@ MODULES = {
     "runs.config": "ResolvedConfig resolve",
     "runs.identity": "recorded_hash",
     "runs.directory": "OWN_FILES RunRequest run_directory",
-    "runs.pretrained": "base_config first_scene make_method named_scenes useful_starts",
+    "runs.pretrained": "base_config first_scene for_starts make_method named_scenes useful_starts",
     "runs.training": "cached_directory",
     "runs.run": "run train_in",
     "runs.decode": "export_model exporter_of open_model read_gaussians",
@@ -45,6 +45,7 @@ MODULES = {
     "cli.complete": "SCENE name_of",
     "cli.paths": "EXISTING OUTPUT_FILE OUTPUT_FOLDER existing_file",
     "cli.setup": "Choices open_session takes_choices",
+    "plugins.remedies": "as_installed",
 }
 """Module of the core -> the names that it lends. `tooling.pyi` repeats them for type checkers."""
 BASE = {"files": "bytes_with_named file_sha256 new_folder write_atomic write_json", "progress": "Bar"}

@@ -43,6 +43,7 @@ from splatwizard_core.plugins.loading import PluginInfo as PluginInfo
 from splatwizard_core.plugins.manager import PluginManager as PluginManager
 from splatwizard_core.plugins.manager import load_plugins as load_plugins
 from splatwizard_core.plugins.registry import Entry as Entry
+from splatwizard_core.plugins.remedies import as_installed as as_installed
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer as NegotiatedRasterizer
 from splatwizard_core.runs.config import ResolvedConfig as ResolvedConfig
 from splatwizard_core.runs.config import resolve as resolve
@@ -63,6 +64,7 @@ from splatwizard_core.runs.observers import StartedTraining as StartedTraining
 from splatwizard_core.runs.observers import TrainingObserver as TrainingObserver
 from splatwizard_core.runs.pretrained import base_config as base_config
 from splatwizard_core.runs.pretrained import first_scene as first_scene
+from splatwizard_core.runs.pretrained import for_starts as for_starts
 from splatwizard_core.runs.pretrained import make_method as make_method
 from splatwizard_core.runs.pretrained import named_scenes as named_scenes
 from splatwizard_core.runs.pretrained import useful_starts as useful_starts

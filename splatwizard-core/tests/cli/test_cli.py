@@ -125,7 +125,7 @@ def test_a_run_that_no_package_reports_ends_in_a_line(tmp_path: Path, monkeypatc
         (["info", "/nowhere/at-all"], "/nowhere/at-all"),
         (["decode", "/nowhere/scene.swz"], "there is no such file"),
         (["eval", "/nowhere/scene.swz"], "there is no such file"),
-        (["eval", "{text}"], "not a .swz file"),
+        (["eval", "{text}", "--scene", "demo:tiny"], "not a .swz file"),
         (["info", "{text}"], "{text}"),
         (["encode", "{text}"], "takes a run directory or a .ply"),
         (["export", "{text}", "x.ply"], "not a .swz file"),
@@ -145,7 +145,7 @@ def test_a_run_that_no_package_reports_ends_in_a_line(tmp_path: Path, monkeypatc
         (["decode", "{text}", "--out", "{folder}"], "{folder} is a folder: give the name of a file in it"),
         (["encode", "{text}", "--out", "{folder}/none/x.swz"], "there is no folder {folder}/none"),
         (["eval", "{text}", "--metrics", ","], "--metrics is empty"),
-        (["eval", "{text}", "--metrics", "pnsr"], "no metric is called 'pnsr'"),
+        (["eval", "{text}", "--scene", "demo:tiny", "--metrics", "pnsr"], "no metric is called 'pnsr'"),
         (["eval", "{text}", "--renders", "{text}"], "cannot write into {text}: it is a file"),
     ],
 )  # fmt: skip
@@ -391,3 +391,28 @@ def test_ctrl_c_leaves_a_training_that_resumes(tmp_path: Path):
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["steps"] == 400
     assert log.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["run", "--iterations", "300"], "--set iterations=300"),
+        (["run", "--method", "3dgs", "--grad-threshold=4e-4"], "--set densify.grad_threshold=4e-4"),
+        (["train", "--densify.grad_threshold", "4e-4"], "--set densify.grad_threshold=4e-4"),
+        (["eval", "scene.ply", "--test-every", "4"], "--set test_every=4"),
+        (["schedule", "3dgs", "--iterations"], "--set iterations=VALUE"),
+        (["run", "--log-every", "5"], "--set log_every=5"),
+    ],
+)
+def test_a_key_that_is_given_as_an_option_is_answered_with_set(arguments, told, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"error: no option {arguments[-1] if told.endswith('VALUE') else '--'}")
+    assert line.endswith(f"it is a key of the configuration, give {told}")
+
+
+@pytest.mark.parametrize("arguments", [["run", "--nonsense", "3"], ["list-plugins", "--iterations", "3"]])
+def test_an_option_that_is_no_key_is_no_option(arguments, capsys):
+    assert main(arguments) == 2
+    assert "No such option" in capsys.readouterr().err

@@ -14,6 +14,7 @@ from sw_gaussians.ply import export_ply
 from sw_gaussians.start import gaussians_from_points
 
 from splatwizard_core.cli.main import main
+from splatwizard_core.cli.setup import Choices
 from splatwizard_core.errors import CheckpointError, ConfigError, SplatwizardError, UserInputError
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.runs.config import ResolvedConfig, parse_set, resolve
@@ -224,6 +225,21 @@ def test_of_several_methods_those_that_start_from_nothing_leave_it_to_the_others
     assert (pupil.pretrained, taught.pretrained) == ({"iterations": 3}, {})
 
 
+def test_what_is_set_for_several_methods_also_trains_what_one_of_them_starts_from(toy_plugins):
+    def resolved(*methods: str, sets: tuple[str, ...] = ("iterations=3", "codec.kind=f2", "log_every=5")):
+        return Choices(methods, sets=sets).resolve(toy_plugins)
+
+    plain, student = resolved("toy", "toy-student")
+    assert (plain.config.iterations, dict(plain.pretrained)) == (3, {})
+    assert (student.config.iterations, dict(student.pretrained)) == (3, {"iterations": 3})
+    told: list[str] = []
+    Choices(("toy",), preset="quick").settled([plain, student], toy_plugins, lambda each: None, told.append)
+    assert told == ["toy-student: the trained scene that it starts from has iterations=3 too"]
+    assert not resolved("toy-student")[0].pretrained  # said of it alone
+    _, own = resolved("toy", "toy-student", sets=("iterations=3", "pretrained.iterations=5"))
+    assert dict(own.pretrained) == {"iterations": 5}
+
+
 def test_a_teacher_is_trained_as_asked(toy_plugins, tmp_path):
     found, _ = Run(toy_plugins, tmp_path).train("pretrained.iterations=2", method="toy-pupil")
     assert found.facts["pretraining"]["toy"]["steps"] == 2
@@ -258,7 +274,14 @@ def test_an_ordinary_run_takes_what_others_started_from(toy_plugins, tmp_path):
 def test_a_finished_student_is_encoded_from_its_directory(toy_plugins, tmp_path, capsys):
     _, directory = Run(toy_plugins, tmp_path / "out").train()
     assert main(["encode", str(directory), "--out", str(tmp_path / "x.swz"), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["bytes"] == (tmp_path / "x.swz").stat().st_size
+    facts, size = json.loads(capsys.readouterr().out), (tmp_path / "x.swz").stat().st_size
+    assert facts["bytes"] == size
+    assert facts["ratio"] == facts["float32_bytes"] / size
+    assert main(["eval", str(tmp_path / "x.swz"), "--scene", "demo:tiny", "--no-speed", "--json"]) == 0
+    assert facts["psnr"] == pytest.approx(json.loads(capsys.readouterr().out)["metrics"]["psnr"]["mean"])
+    assert main(["encode", str(directory), "--out", str(tmp_path / "x.swz"), "--no-psnr"]) == 0
+    told = capsys.readouterr().out
+    assert f"{size:,} bytes, {1 / facts['ratio']:.1f} x larger than its parameters as float32, in " in told  # a toy
 
 
 def sw(arguments: list[str], **options: object) -> "subprocess.Popen[str]":

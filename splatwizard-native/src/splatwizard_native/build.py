@@ -73,4 +73,8 @@ def build_all(
         return BuildRow(module.name, "up to date" if fresh else "built", time.monotonic() - started, path)
 
     with ThreadPoolExecutor(max_workers=max(1, len(targets))) as pool:
-        return list(pool.map(build, targets))
+        try:
+            return list(pool.map(build, targets))
+        except BaseException:  # asked to end: the threads of the pool wait for compilers
+            tools.stop()
+            raise

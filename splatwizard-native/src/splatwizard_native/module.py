@@ -11,9 +11,11 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import itertools
+import json
 import logging
 import platform
 import shutil
+import statistics
 import sys
 import tempfile
 import time
@@ -62,7 +64,8 @@ class NativeModule:
     headers         every header that the files above include from the package; globs are allowed
     cuda_sources    .cu files, compiled (with SW_WITH_CUDA defined everywhere) only if torch has CUDA and nvcc is there
     cflags          more flags for sources and kernels
-    seconds         about how long it takes to compile, told to the user
+    seconds         how long it takes to compile beside other modules; what the user is told comes from builds that were
+                    measured on this machine
     without         what happens without this module, told to the user when it cannot be built
     """
 
@@ -326,7 +329,9 @@ class NativeModule:
         return jobs
 
     def _compile(self, library: Path, march: str, tools: Toolchain, say: Say) -> None:
-        say(f"compiling kernels '{self.name}' (once, about {self.seconds} s) ...")
+        expected = self.expected_seconds(march)
+        about = "" if expected is None else f", about {expected:.0f} s by earlier builds here"
+        say(f"compiling kernels '{self.name}' (once{about}) ...")
         started, cuda = time.monotonic(), self._with_cuda()
         build_log = library.with_suffix(".log")
         build_log.unlink(missing_ok=True)
@@ -345,12 +350,31 @@ class NativeModule:
             seconds = round(time.monotonic() - started, 1)
             facts = {
                 "seconds": seconds,
+                "share": self.seconds,
                 "compiler": tools.version(),
                 "march": march,
                 "architectures": cuda_toolkit.architectures() if cuda else [],
             }
             install(built, library, facts)
         say(f"compiled kernels '{self.name}' in {seconds:.0f} s")
+
+    def expected_seconds(self, march: str = "native") -> float | None:
+        """Return how long a build takes, by those that were measured here: its own last one, else as others went.
+
+        None: there is none of this kind.
+        """
+        cuda, mine, others = self._with_cuda(), [], []
+        for file in sorted(self.cache_folder.glob("*.json"), key=lambda path: path.stat().st_mtime):
+            try:
+                facts = json.loads(file.read_text("utf-8"))
+                if facts["march"] != march or bool(facts["architectures"]) != cuda:
+                    continue
+                if file.name.startswith(f"{self.name}-"):
+                    mine.append(float(facts["seconds"]))
+                others.append(float(facts["seconds"]) / float(facts["share"]))
+            except (OSError, ValueError, KeyError, TypeError, ZeroDivisionError):
+                continue  # of another release, or damaged
+        return mine[-1] if mine else statistics.median(others) * self.seconds if others else None
 
     def _check_headers(self, jobs: list[Job]) -> None:
         """A header of the package that is not declared would let a stale build pass for a fresh one."""

@@ -12,8 +12,10 @@ import platform
 import re
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
@@ -119,6 +121,7 @@ class Toolchain:
 
     def __init__(self, jobs: int | None = None) -> None:
         limit = os.environ.get("MAX_JOBS", "")
+        self._compilers = Compilers()
         self._pool = ThreadPoolExecutor(jobs or (int(limit) if limit.isdigit() else 0) or available_cores())
         self.compiler = find_compiler()
 
@@ -133,8 +136,12 @@ class Toolchain:
         for job in jobs:
             compiler = [str(cuda_toolkit.find_nvcc())] if job.cuda else self.compiler
             written = ["-MD", "-MF", f"{job.output}.d", "-c", str(job.source), "-o", str(job.output)]
-            runs.append(self._pool.submit(_run, [*compiler, *job.flags, *written], log))
-        wait(runs)
+            runs.append(self._pool.submit(self._compilers.run, [*compiler, *job.flags, *written], log))
+        try:
+            wait(runs)
+        except BaseException:  # asked to end: nobody waits for what compilers do meanwhile
+            self.stop()
+            raise
         for run in runs:
             run.result()
 
@@ -149,7 +156,18 @@ class Toolchain:
         extra = ["-fopenmp"] if sys.platform != "darwin" else ["-undefined", "dynamic_lookup"]
         first = [*map(str, objects), *runtime_libraries()]
         command = [*self.compiler, "-shared", *first, "-o", str(output), *extra, *libraries]
-        self._pool.submit(_run, command, log).result()
+        try:
+            self._pool.submit(self._compilers.run, command, log).result()
+        except NativeBuildError:
+            raise
+        except BaseException:
+            self.stop()
+            raise
+
+    def stop(self) -> None:
+        """End the compilers that run, with the processes that they started, and start no other."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+        self._compilers.stop()
 
 
 def runtime_libraries() -> list[str]:
@@ -165,17 +183,43 @@ def runtime_libraries() -> list[str]:
     return []
 
 
-def _run(command: list[str], log: Path) -> None:
-    result = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False)
-    text = result.stdout.decode("utf-8", errors="replace")
-    with open(log, "a", encoding="utf-8") as handle:
-        handle.write(f"$ {shlex.join(command)}\n{text}\n")
-    if result.returncode < 0:
-        raise NativeBuildError(
-            f"the compiler was killed by signal {-result.returncode} (out of memory?): try again with MAX_JOBS=1"
-        )
-    if result.returncode != 0:
-        raise NativeBuildError(_excerpt(text))
+class Compilers:
+    """Compilers that run, each the leader of a group of processes: `g++` only starts what does the work."""
+
+    def __init__(self) -> None:
+        self._lock, self._running, self._stopped = threading.Lock(), set[subprocess.Popen[bytes]](), False
+
+    def run(self, command: list[str], log: Path) -> None:
+        """Run one to its end, its output to `log`. Raises NativeBuildError if it fails."""
+        with self._lock:
+            if self._stopped:
+                raise NativeBuildError("the build was stopped")
+            process = subprocess.Popen(
+                command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=os.name == "posix"
+            )
+            self._running.add(process)
+        text = process.communicate()[0].decode("utf-8", errors="replace")
+        with self._lock:
+            self._running.discard(process)
+        with open(log, "a", encoding="utf-8") as handle:
+            handle.write(f"$ {shlex.join(command)}\n{text}\n")
+        if process.returncode < 0:
+            raise NativeBuildError(
+                f"the compiler was killed by signal {-process.returncode} (out of memory?): try again with MAX_JOBS=1"
+            )
+        if process.returncode != 0:
+            raise NativeBuildError(_excerpt(text))
+
+    def stop(self) -> None:
+        """Kill all that run: what they wrote so far lies in a folder that is removed."""
+        with self._lock:
+            self._stopped = True
+            for process in self._running:
+                with contextlib.suppress(OSError):
+                    if os.name == "posix":
+                        os.killpg(process.pid, signal.SIGKILL)
+                    else:
+                        process.kill()
 
 
 def _excerpt(text: str) -> str:

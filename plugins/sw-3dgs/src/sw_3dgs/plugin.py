@@ -5,7 +5,7 @@ from splatwizard_core.api import Registry, hookimpl
 
 @hookimpl
 def register_methods(registry: Registry) -> None:
-    registry.add("3dgs", "sw_3dgs.method:ThreeDGS",
+    registry.add("3dgs", "sw_3dgs.method:ThreeDGS", title="3DGS",
                  summary="3D Gaussian Splatting (Kerbl et al. 2023), float32 or quantised",
                  default=True, presets=["paper", "inria", "inria2024", "absgrad", "mcmc", "fast", "fast-cpu", "quick"],
                  rates=["r1", "r2", "r3", "r4", "r5", "r6"], bd_anchor=3,

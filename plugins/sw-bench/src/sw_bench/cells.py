@@ -19,6 +19,7 @@ from splatwizard_core.tooling import (
     RunRequest,
     base_config,
     first_scene,
+    for_starts,
     load_scene,
     make_method,
     named_scenes,
@@ -27,7 +28,7 @@ from splatwizard_core.tooling import (
     useful_starts,
     write_atomic,
 )
-from sw_bench.plan import Plan, set_words
+from sw_bench.plan import Plan, flattened, set_words
 
 SHARED = ".shared"  # in the output folder: configurations of what is trained once for several runs
 TRAINED = ".trained"  # of the core, in each root: trained scenes
@@ -212,6 +213,14 @@ def _resolved(
     if init is not None and os.path.exists(init):
         init = os.path.abspath(init)  # processes on other machines have other working directories
     choices = replace(choices, sets=tuple(set_words(given)), init=init)
+    if len({plan.method_of(each) for each in plan.methods}) > 1:
+        first = choices.resolve(plugins)[0]
+        alike = plan.keys_for_all(scene, seed, given)
+        alike += [key for key, source in first.provenance.items() if source == choices.config_file]
+        shared = for_starts(plugins, first, alike)
+        if shared:
+            tell(f"{label}: the trained scene that it starts from has {', '.join(set_words(shared))} as the plan says")
+        choices = replace(choices, sets=tuple(set_words({**shared, **given})))
     resolved = choices.settled(choices.resolve(plugins), plugins, load, tell)
     for each in resolved:
         load(each)  # it must be there
@@ -270,6 +279,32 @@ def _bases(resolved: ResolvedConfig, plugins: PluginManager) -> list[ResolvedCon
     method = make_method(plugins, resolved)
     first = first_scene(method) if resolved.init else None
     return [base_config(plugins, name, resolved) for name in named_scenes(method) if name != first]
+
+
+def differing_bases(cells: Sequence[Cell], plugins: PluginManager) -> list[str]:
+    """Tell where runs of one scene and seed start from, or are, differently trained scenes of one method."""
+    found: dict[tuple[str, str, int], dict[str, list[tuple[Cell, ResolvedConfig]]]] = {}
+    for cell in {(cell.label, cell.scene, cell.seed): cell for cell in reversed(cells)}.values():
+        for each in [cell.resolved, *_bases(cell.resolved, plugins)]:
+            place = found.setdefault((each.method, cell.scene, cell.seed), {})
+            place.setdefault(training_key(each), []).append((cell, each))
+    lines: dict[str, None] = {}
+    for (method, scene, _), trainings in found.items():
+        if len(trainings) < 2 or all(each.method == cell.resolved.method for group in trainings.values()
+                                     for cell, each in group):  # fmt: skip
+            continue  # variants of one method differ on purpose
+        values = [_flat(group[0][1]) for group in trainings.values()]
+        keys = [key for key in values[0] if len({repr(each.get(key)) for each in values}) > 1][:3]
+        told = "; ".join(
+            f"{', '.join(f'{key}={own[key]}' for key in keys if key in own)} for {', '.join(c.label for c, _ in group)}"
+            for own, group in zip(values, trainings.values(), strict=True)
+        )
+        lines[f"{scene}: the trained {method} scenes differ: {told}"] = None
+    return list(lines)
+
+
+def _flat(resolved: ResolvedConfig) -> dict[str, Any]:
+    return flattened(resolved.training_content()["config"])
 
 
 def _shared_job(key: tuple[int, str], resolved: ResolvedConfig, layout: Layout) -> Job:

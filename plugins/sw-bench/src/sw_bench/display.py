@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 LOG = "log.jsonl"
 TAIL_BYTES = 4096
 REFRESH_SECONDS = 1.0
+SILENCE_SECONDS = 30.0  # without a terminal: whoever reads a log wants to know that it lives
 SLOTS_UNKNOWN = 8  # of a queue that takes everything: for the estimate
 
 
@@ -37,6 +38,7 @@ class Lines:
         self.cells, self.estimates = cells, estimates
         self.states: dict[Cell, str] = dict.fromkeys(cells, "waiting") | dict.fromkeys(finished, "finished")
         self.slots: int | None = None
+        self._told = time.monotonic()
 
     def __enter__(self) -> Lines:
         return self
@@ -63,10 +65,18 @@ class Lines:
         self.tell(line + (f" · about {duration(left)} left" if left is not None and status == "finished" else ""))
 
     def tick(self, sweep: Sweep) -> None:
-        """Nothing to show between two events."""
+        """Say what is running, where nothing was said for half a minute."""
+        now = time.monotonic()
+        if sweep.running and now - self._told >= SILENCE_SECONDS:
+            told = "; ".join(
+                f"{job.name}, {duration(now - at)}{_progress(job)}" for job, at, _ in sweep.running.values()
+            )
+            left = self.left(sweep)
+            self.tell(f"{self.counted()} running   {told}" + (f" · about {duration(left)} left" if left else ""))
 
     def tell(self, line: str) -> None:
         """Print a line."""
+        self._told = time.monotonic()
         say(line)
 
     def counted(self) -> str:

@@ -56,7 +56,7 @@ class Values(Table):
     @field_validator("set")
     @classmethod
     def _flat(cls, value: dict[str, Any]) -> dict[str, Any]:
-        found = _flattened(value)
+        found = flattened(value)
         if "seed" in found:
             raise ValueError("`seeds` of the plan gives the seeds, not `set`")
         return found
@@ -130,6 +130,15 @@ class Plan(Values):
             found |= {name: value for name, value in given.items() if value is not None} | {"set": merged}
         return Values(**found)
 
+    def keys_for_all(self, scene: str, seed: int, given: Mapping[str, Any]) -> list[str]:
+        """Return those keys of a run's `set` whose value is said of all methods on its scene and seed."""
+        tables = [self, self.scene.get(scene, Values())]
+        tables += [each for each in self.override if not each.methods and each.meets("", scene, seed)]
+        said: dict[str, Any] = {}
+        for each in tables:
+            said |= each.set
+        return [key for key, value in given.items() if key in said and said[key] == value]
+
     def part(self, methods: Iterable[str], scenes: Iterable[str], seeds: Iterable[int]) -> Plan:
         """Return the plan with these methods, scenes and seeds alone; an empty one of them leaves all."""
         wanted: dict[str, tuple[Any, ...]] = {
@@ -190,10 +199,11 @@ def _spelled(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def _flattened(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flattened(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Spell tables of tables by dotted keys."""
     found: dict[str, Any] = {}
     for key, value in table.items():
-        found |= _flattened(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+        found |= flattened(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
     return found
 
 

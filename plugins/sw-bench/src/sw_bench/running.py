@@ -24,7 +24,7 @@ from splatwizard_core.tooling import (
     print_table,
     say,
 )
-from sw_bench.cells import Cell, Job, Layout, cells_of, jobs_of, prepare, training_key
+from sw_bench.cells import Cell, Job, Layout, cells_of, differing_bases, jobs_of, prepare, training_key
 from sw_bench.display import Lines, LiveTable
 from sw_bench.estimates import Estimates
 from sw_bench.executor import Executor, Site
@@ -95,6 +95,9 @@ def _plan_of_words(methods: list[str], scenes: list[str], seeds: list[int], give
         said = Choices(methods=tuple(methods), config_file=file)
         default["methods"] = said.method_names(plugins)[0]
         default["scenes"] = default["scenes"] if scenes else said.resolve(plugins)[0].scene_spec
+    if not scenes:
+        started = Choices(init=given["init"], config_file=file, sets=tuple(given["sets"])).of_start()
+        default["scenes"] = started.scene or default["scenes"]
     content: dict[str, Any] = {
         "methods": methods or [name for name in [default["methods"]] if name],
         "scenes": scenes or [name for name in [default["scenes"]] if name],
@@ -161,6 +164,8 @@ def bench_plan(wanted: Wanted, given: Mapping[str, Any]) -> int:
         states |= {cell: State.BEGUN for cell in cells if states[cell] is State.FINISHED}
     unfinished = [cell for cell in cells if states[cell] is not State.FINISHED]
     jobs = jobs_of(unfinished, layout, plugins)
+    for line in differing_bases(cells, plugins):
+        say(f"note: {line}")
     if given["dry_run"]:
         from sw_bench.dry_run import dry_run
 

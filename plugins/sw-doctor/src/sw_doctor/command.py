@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import click
 
-from splatwizard_core.tooling import debug_option, json_option, options, print_json
+from splatwizard_core.tooling import as_installed, debug_option, json_option, options, print_json
 
 if TYPE_CHECKING:
     from sw_doctor.diagnosis import Diagnosis
@@ -25,6 +26,7 @@ def doctor(as_json: bool) -> None:
     from sw_doctor.diagnosis import examine
 
     found = examine()
+    found = replace(found, checks=[replace(each, mend=each.mend and as_installed(each.mend)) for each in found.checks])
     if as_json:
         print_json(found.as_dict())
     else:

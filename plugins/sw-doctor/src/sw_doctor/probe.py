@@ -171,7 +171,9 @@ def check_kernels(target: str) -> Check:
     if facts["state"] == "damaged":
         detail = "the build in the cache is damaged"
         return Check("kernels", module.name, "broken", detail, f"{build} --force", facts=facts)
-    detail = f"not built; compiled when first used (about {module.seconds} s)"
+    expected = module.expected_seconds()
+    about = "" if expected is None else f" (about {expected:.0f} s, by earlier builds)"
+    detail = f"not built; compiled when first used{about}"
     return Check("kernels", module.name, "missing", f"{detail}. Without: {module.without}", build, facts=facts)
 
 

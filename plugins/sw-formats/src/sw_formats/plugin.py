@@ -5,13 +5,15 @@ from splatwizard_core.api import Registry, hookimpl
 
 @hookimpl
 def register_methods(registry: Registry) -> None:
-    registry.add("spz", "sw_formats.methods:Spz", summary="a trained 3DGS scene as .spz (Niantic)",
+    registry.add("spz", "sw_formats.methods:Spz", title="SPZ",
+                 summary="a trained 3DGS scene as .spz (Niantic)",
                  presets=["paper", "quick"], rates=["r1", "r2", "r3"])  # fmt: skip
-    registry.add("sog", "sw_formats.methods:Sog", summary="a trained 3DGS scene as .sog (PlayCanvas)",
+    registry.add("sog", "sw_formats.methods:Sog", title="SOG",
+                 summary="a trained 3DGS scene as .sog (PlayCanvas)",
                  presets=["paper", "quick"], rates=["r1", "r2", "r3"])  # fmt: skip
     registry.add("splat", "sw_formats.methods:Splat", summary="a trained 3DGS scene as .splat (antimatter15)",
                  presets=["paper", "quick"], rates=["r1"])  # fmt: skip
-    registry.add("compressed-ply", "sw_formats.methods:CompressedPly",
+    registry.add("compressed-ply", "sw_formats.methods:CompressedPly", title="compressed PLY",
                  summary="a trained 3DGS scene as compressed .ply (PlayCanvas)",
                  presets=["paper", "quick"], rates=["r1"])  # fmt: skip
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from splatwizard_core.tooling import (
+    OUTPUT_FILE,
     OUTPUT_FOLDER,
     SCENE,
     Choices,
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from sw_geometry.parameters import Parameters
     from sw_geometry.settings import MeshSettings
 
+MESH = ".ply"
 LENGTH = click.FloatRange(min=0, min_open=True)
 
 
@@ -33,13 +35,22 @@ def _depths(_context: click.Context, _parameter: click.Parameter, incomplete: st
     return [mode for mode in ("expected", "median", "ratio=") if mode.startswith(incomplete)]
 
 
+def _target(context: click.Context, parameter: click.Parameter, value: str | None) -> Path | None:
+    """A folder, or a .ply that is not there as a folder."""
+    if value is None:
+        return None
+    is_file = Path(value).suffix.lower() == MESH and not Path(value).is_dir()
+    return (OUTPUT_FILE if is_file else OUTPUT_FOLDER).convert(value, parameter, context)
+
+
 @click.command(short_help="the surface of a scene as a triangle mesh")
 @click.argument("file", metavar="FILE|RUN", type=click.Path())
 @options(
     click.option("--scene", metavar="SCENE", type=SCENE,
-                 help="Whose cameras see it.  [default: that of the run directory]"),
-    click.option("--out", metavar="DIR", type=OUTPUT_FOLDER,
-                 help="Folder for mesh.ply, mesh_post.ply, mesh.png, mesh.json.  [default: RUN/mesh, else mesh]"),
+                 help="Whose cameras see it.  [default: that of the run directory, or of the one that FILE lies in]"),
+    click.option("--out", metavar="DIR|FILE.ply", type=click.Path(), callback=_target,
+                 help="Folder for mesh.ply, mesh_post.ply, mesh.png, mesh.json; or one file, for the mesh of "
+                 "mesh_post.ply alone.  [default: RUN/mesh, else mesh]"),
     click.option("--voxel-size", type=LENGTH, metavar="X",
                  help="Edge of a voxel, scene units.  [default: depth-trunc / mesh-res; DTU 0.004]"),
     click.option("--sdf-trunc", type=LENGTH, metavar="X",
@@ -93,16 +104,18 @@ def mesh(
         open_session,
         open_subject,
     )
-    from sw_geometry.files import write_files
+    from sw_geometry.files import POST, write_files
     from sw_geometry.metrics import build_from_model
     from sw_geometry.open3d_import import Open3DMissing, import_open3d
     from sw_geometry.parameters import resolve, stated
+    from sw_geometry.ply import write_mesh
 
     run = Path(file) if (Path(file) / "config.toml").is_file() else None
     path = existing_file(run / "scene.swz" if run is not None else file)
     config = None if run is None else str(run / "config.toml")
     target = out or (run / "mesh" if run is not None else Path("mesh"))
-    chosen = Choices(scene=scene, config_file=config, sets=sets, device=device).resolve_without_method()
+    choices = Choices(scene=scene, config_file=config, sets=sets, device=device)
+    chosen = choices.of_file(path).resolve_without_method()
     settings, setup = _settings(chosen.metrics, given, no_mask)
     try:
         import_open3d()  # before the work, not after it
@@ -122,13 +135,16 @@ def mesh(
         "world_origin": list(loaded.origin),
         "rasterizers": dict(subject.rasterizer.choices), **({"chamfer": scores} if scores else {}),
     }  # fmt: skip
-    files = write_files(target, built, loaded, facts, culled)
+    alone = target.suffix.lower() == MESH and not target.is_dir()
+    if alone:
+        write_mesh(built.post, target)
+    files = [target.name] if alone else write_files(target, built, loaded, facts, culled)
     if as_json:
-        print_json({**facts, "folder": str(target), "files": files})
+        print_json({**facts, "folder": str(target.parent if alone else target), "files": files})
         return
     click.echo(
         f"mesh: {len(built.post.vertices):,} vertices, {len(built.post):,} triangles, "
-        f"voxel {parameters.voxel_size:.4g}, {built.facts['seconds']:.1f} s: {target / 'mesh_post.ply'}"
+        f"voxel {parameters.voxel_size:.4g}, {built.facts['seconds']:.1f} s: {target if alone else target / POST}"
     )
     if any(loaded.origin):
         click.echo(f"its coordinates are those about the scene's local origin, which lies at {loaded.origin}")

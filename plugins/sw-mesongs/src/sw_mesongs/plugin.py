@@ -5,7 +5,7 @@ from splatwizard_core.api import Registry, hookimpl
 
 @hookimpl
 def register_methods(registry: Registry) -> None:
-    registry.add("mesongs", "sw_mesongs.method:MesonGS",
+    registry.add("mesongs", "sw_mesongs.method:MesonGS", title="MesonGS",
                  summary="MesonGS (Xie et al. 2024): prune, octree, RAHT, codebook, fine-tune what is decoded",
                  presets=["paper", "nerf_synthetic", "mipnerf360", "tandt", "db", "quick"],
                  rates=["r1", "r2", "r3", "r4"],

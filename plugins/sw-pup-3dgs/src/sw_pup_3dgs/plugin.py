@@ -5,7 +5,7 @@ from splatwizard_core.api import Registry, hookimpl
 
 @hookimpl
 def register_methods(registry: Registry) -> None:
-    registry.add("pup-3dgs", "sw_pup_3dgs.method:Pup3DGS",
+    registry.add("pup-3dgs", "sw_pup_3dgs.method:Pup3DGS", title="PUP-3DGS",
                  summary="removes 90 % of a trained 3DGS scene by its Fisher information (Hanson et al. 2025)",
                  presets=["paper", "splatwizard", "quick"],
                  rates=["r1", "r2", "r3", "r4", "r5", "r6"],

@@ -74,7 +74,7 @@ def bake(
     if file.is_dir():
         chosen = replace(chosen, config_file=chosen.config_file or str(file / "config.toml"))
         file = encoded_file(file)
-    resolved = chosen.resolve_without_method()
+    resolved = chosen.of_file(file).resolve_without_method()
     plugins = load_plugins()
     name = exporter_of(out, plugins, exporter)  # before the work, not after it
     drawing = open_drawing(file, open_session(resolved, plugins), resolved)

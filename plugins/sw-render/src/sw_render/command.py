@@ -128,9 +128,10 @@ def render(
 ) -> None:
     """Draw FILE from the cameras of a scene, as 8-bit PNG; with --depth, --normals, --alpha also maps.
 
-    FILE is a .swz, a .ply, or a run directory: then its scene.swz, on its own scene. Any method can be drawn with
-    depth; only surfels have normals of their own. With --trajectory the cameras move, and --video makes one file of the
-    frames. What the arrays hold, and the JSON of cameras, is in the README of sw-render.
+    FILE is a .swz, a .ply, or a run directory: then its scene.swz. Without --scene the scene is that of the run
+    directory, or of the one that the file lies in. Any method can be drawn with depth; only surfels have normals of
+    their own. With --trajectory the cameras move, and --video makes one file of the frames. What the arrays hold, and
+    the JSON of cameras, is in the README of sw-render.
     """
     from sw_render.drawing import encoded_file, open_drawing
     from sw_render.exr import exr_library
@@ -159,7 +160,7 @@ def render(
     if file.is_dir():
         chosen = replace(chosen, config_file=chosen.config_file or str(file / "config.toml"))
         file = encoded_file(file)
-    resolved = chosen.resolve_without_method()
+    resolved = chosen.of_file(file).resolve_without_method()
     drawing = open_drawing(file, open_session(resolved, load_plugins()), resolved)
     if trajectory is None:
         path, drawn = None, drawing.views(views)

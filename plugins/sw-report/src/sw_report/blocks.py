@@ -12,12 +12,29 @@ from sw_report.pictures import Gallery
 
 @dataclass(frozen=True)
 class Column:
-    """text: left-aligned; long: may break into lines; code: in a typewriter's letters."""
+    """text: left-aligned; long: may break into lines; code: in a typewriter's letters.
+
+    key         what `--columns` calls it; empty: it cannot be left out
+    better      "higher" or "lower"; empty: neither
+    """
 
     name: str
     text: bool = False
     long: bool = False
     code: bool = False
+    key: str = ""
+    better: str = ""
+
+
+class Note(str):
+    """A line under a table, and the keys of the columns that it is about; without any it is about all."""
+
+    about: frozenset[str]
+
+    def __new__(cls, text: str, *about: str) -> Note:
+        found = super().__new__(cls, text)
+        found.about = frozenset(about)
+        return found
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,14 @@ if TYPE_CHECKING:
     from sw_report.runs import Run
 
 
+def _columns(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[str]:
+    """Complete the last word of the list."""
+    from sw_report.selection import KNOWN
+
+    before, comma, last = incomplete.rpartition(",")
+    return [before + comma + name for name in ("all", "paper", *KNOWN) if name.startswith(last)]
+
+
 @click.command(short_help="tables, curves, BD-rates, one HTML page")
 @click.argument("folders", metavar="DIR...", nargs=-1, required=True, type=click.Path())
 @options(
@@ -39,6 +47,10 @@ if TYPE_CHECKING:
     click.option("--markdown", "form", flag_value="markdown", help="Print Markdown tables."),
     click.option("--json", "form", flag_value="json", help="Print one JSON object: runs, means, BD values, notes."),
     click.option("--jsonl", "form", flag_value="jsonl", help="Print one JSON object a run."),
+    click.option("--columns", metavar="NAME[,NAME]", shell_complete=_columns,
+                 help="Columns of the tables: method, rate, scenes, seeds, psnr, ssim, lpips (or any metric), size, "
+                 "primitives, steps, train, encode, decode, fps; `all`, or `paper`: method, rate, psnr, ssim, lpips, "
+                 "size.  [default: paper with --latex, else all]"),
     click.option("--anchor", metavar="METHOD", type=name_of("method"),
                  help="What BD-rates compare against.  [default: the most usual "
                  "of the methods whose curve overlaps with others]"),
@@ -55,6 +67,7 @@ def report(
     survey: Path | None,
     plots: Path | None,
     form: str | None,
+    columns: str | None,
     anchor: str | None,
     pareto: bool,
     partial: bool,
@@ -66,11 +79,18 @@ def report(
     option that prints something else, tables are printed as text.
     """
     from sw_report import exports
-    from sw_report.distortion import choose_anchor
+    from sw_report.distortion import bd_tables, choose_anchor, why_no_values
     from sw_report.runs import collect
+    from sw_report.selection import PAPER, chosen_columns, selected
 
+    if columns is not None and form in ("csv", "json", "jsonl"):
+        raise click.UsageError(f"--columns is for tables; --{form} has all values")
     collection = collect([Path(folder) for folder in folders])
     against = choose_anchor(collection.runs, anchor)
+    if anchor is not None and against is not None:
+        values = bd_tables(collection.runs, against, pareto=pareto, partial=partial)
+        for line in why_no_values(collection.runs, against, values):
+            say(line)
     if html is not None:
         from sw_report.page import PageOptions, write_page
 
@@ -92,6 +112,8 @@ def report(
         print_json(exports.to_dict(collection, anchor=against, partial=partial, pareto=pareto))
     elif form is not None or (html is None and survey is None and plots is None):
         tables = exports.tables_of(collection, anchor=against, partial=partial, pareto=pareto)
+        wanted = chosen_columns(columns, [t for _, t in tables], default=PAPER if form == "latex" else None)
+        tables = [(title, selected(table, wanted)) for title, table in tables]
         if form == "latex":
             from sw_report.latex import to_latex
 

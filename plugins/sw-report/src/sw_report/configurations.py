@@ -42,7 +42,7 @@ def configurations(runs: Sequence[RunFacts]) -> list[Configuration]:
         if any(_is_given(who) and who != "--set" for who in source.values()):  # its own config.toml, most likely
             keys, settings = rate_settings(run.method, run.preset, run.rate)
             rated |= keys
-            usual[run.preset, run.rate] = {**_texts(settings), **usual[run.preset, run.rate]}
+            usual[run.preset, run.rate] = {**texts(settings), **usual[run.preset, run.rate]}
     blocks = {key.partition(".")[0] for key in rated}
     chosen_by_scene = _chosen_by_scene(runs, values, sources)
     defaults: dict[str, str] = {}
@@ -101,22 +101,22 @@ def _values(run: RunFacts) -> Iterator[tuple[str, str]]:
     """Yield (dotted key, value as JSON) of all that may change a result."""
     config = run.config or {}
     yield PRESET, json.dumps(run.preset)
-    yield from _texts(config.get("config")).items()
-    yield from ((k, v) for k, v in _texts(config.get("pipeline")).items() if k not in CHANGES_NO_RESULT)
-    yield from ((k, v) for k, v in _texts(config.get("scene")).items() if k in NOT_IN_THE_PROTOCOL)
-    yield from _texts(config.get("pretrained"), "pretrained.").items()
+    yield from texts(config.get("config")).items()
+    yield from ((k, v) for k, v in texts(config.get("pipeline")).items() if k not in CHANGES_NO_RESULT)
+    yield from ((k, v) for k, v in texts(config.get("scene")).items() if k in NOT_IN_THE_PROTOCOL)
+    yield from texts(config.get("pretrained"), "pretrained.").items()
     for name, scene in (run.train.pretraining or {}).items():
         told = {"file": scene.file.get("sha256"), "preset": scene.preset, "steps": scene.steps}
-        yield from _texts({k: v for k, v in told.items() if v is not None}, f"{name} scene.").items()
+        yield from texts({k: v for k, v in told.items() if v is not None}, f"{name} scene.").items()
 
 
-def _texts(block: object, prefix: str = "") -> dict[str, str]:
+def texts(block: object, prefix: str = "") -> dict[str, str]:
     """Flatten tables of tables to dotted keys and JSON texts; an empty table says nothing."""
     found: dict[str, str] = {}
     if isinstance(block, dict):
         for name, value in block.items():
             if isinstance(value, dict):
-                found |= _texts(value, f"{prefix}{name}.")
+                found |= texts(value, f"{prefix}{name}.")
             else:
                 found[f"{prefix}{name}"] = json.dumps(value, sort_keys=True, default=str)
     return found

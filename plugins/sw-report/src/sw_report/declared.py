@@ -92,6 +92,19 @@ def dataset_facts(name: str) -> DatasetFacts:
     return DatasetFacts(str(declared.get("title", name)), tuple(map(str, scenes)), str(declared.get("prefix", "")))
 
 
+def method_title(method: str) -> str:
+    """Name of a method as its paper writes it; its key where nothing is declared."""
+    methods = load_plugins().methods
+    return str(methods.entry(method).declared.get("title", method)) if method in methods else method
+
+
+def rate_position(method: str, rate: str) -> float:
+    """Place of a rate point in the order that its method declares; infinite where it declares none."""
+    methods = load_plugins().methods
+    declared = methods.entry(method).declared.get("rates", ()) if method in methods else ()
+    return list(declared).index(rate) if rate in declared else math.inf
+
+
 def bd_anchor_rank(method: str) -> float:
     """Rank of a method among those that BD-rates usually compare against, smallest first; infinite for others."""
     methods = load_plugins().methods
@@ -125,6 +138,14 @@ def float32_bytes(encoders: Iterable[tuple[str, str]], counts: Mapping[str, int]
     if len(whole) != 1 or "stores" in whole[0] or set(counts) != {"num_gaussians"} or degree not in range(4):
         return None
     return 4 * (11 + 3 * (degree + 1) ** 2) * counts["num_gaussians"]  # mean, scale, quaternion, opacity; harmonics
+
+
+def encoding_keys(method: str) -> tuple[str, ...]:
+    """Keys of a method that its training does not read: those it says itself, else `codec`."""
+    try:
+        return tuple(load_plugins().methods.entry(method).load().Config.ENCODING)
+    except Exception:  # not installed, another release, or a stranger's fault
+        return ("codec",)
 
 
 def rate_settings(method: str, preset: str | None, rate: str | None) -> tuple[set[str], dict[str, Any]]:

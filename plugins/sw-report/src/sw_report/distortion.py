@@ -179,6 +179,25 @@ def with_values(tables: Iterable[BdTable]) -> tuple[list[BdTable], list[str]]:
     return kept, [f"No BD values by {', '.join(labels)}: {why}." for why, labels in reasons.items() if why]
 
 
+def why_no_values(runs: Sequence[Run], anchor: str, tables: Sequence[BdTable]) -> list[str]:
+    """Say why an anchor that somebody asked for compares with nothing; empty where it does."""
+    kept, reasons = with_values(tables)
+    if kept:
+        return []
+    if not tables:
+        return [f"--anchor {anchor}: there is no other method on its scenes, under its protocol, to compare with"]
+    metric, lines = tables[0].metric, [f"--anchor {anchor}: {reason}" for reason in reasons]
+    for place in dict.fromkeys(run.place for run in runs if run.variant == anchor):
+        reached = []
+        for variant in dict.fromkeys(run.variant for run in runs):
+            found = [v for run in runs if run.place == place and run.variant == variant
+                     and (v := run.mean(metric)) is not None]  # fmt: skip
+            if found:
+                reached.append(f"{variant} {min(found):.2f} to {max(found):.2f}")
+        lines.append(f"{place[0]}: {metric_style(metric).heading} of {', '.join(reached)}")
+    return lines
+
+
 def curve(runs: Sequence[Run], metric: str) -> tuple[list[float], list[float]]:
     """(bytes, quality), quality turned so that higher is better."""
     known = [(run, value) for run in runs if (value := run.mean(metric)) is not None]

@@ -109,6 +109,7 @@ def run_dict(run: Run) -> dict[str, Any]:
         "sections": facts.file.sections,
         "counts": {unit: round(n) for unit, n in run.counts.items()},
         "steps": facts.train.steps,
+        "pretraining_steps": {name: scene.steps for name, scene in (facts.train.pretraining or {}).items()},
         "train_s": run.over_seeds(lambda each: each.train.train_s)[0],
         "with_pretraining_s": run.over_seeds(lambda each: each.train.with_pretraining_s)[0],
         "encode_s": run.over_seeds(lambda each: each.codec.encode_s)[0],

@@ -110,6 +110,7 @@ class PretrainingFacts(Facts):
 
     file: dict[Text, Text] = {}
     preset: Text | None = None
+    config: dict[str, Any] | None = None
     steps: int | None = None
     train_s: float | None = None
 
@@ -123,6 +124,12 @@ class TrainFacts(Facts):
     memory_kind: Text | None = None
     breakdown_s: dict[Text, dict[Text, float]] | None = None
     trained_in: Text | None = None
+
+    def all_steps(self) -> str:
+        """Steps of the scenes that the training started from, or was taught by, and its own: `30,000 + 5,000`."""
+        before = [numbers.count(scene.steps) if "name" not in scene.file else "file"
+                  for scene in (self.pretraining or {}).values()]  # fmt: skip
+        return " + ".join([*before, numbers.count(self.steps)])
 
     def started_from(self) -> str:
         """Trained scenes that the training started from, in words; empty if there are none."""

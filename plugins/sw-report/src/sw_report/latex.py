@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 
 from splatwizard_core.tooling import short_reason
 from sw_report import numbers
 from sw_report.aggregate import DatasetTable, comparable, dataset_tables
 from sw_report.blocks import Cell, Table
+from sw_report.declared import rate_position
 from sw_report.marks import marked_values
 from sw_report.results_tables import metric_names
-from sw_report.runs import Run
+from sw_report.runs import Run, natural
 
 _SPELLED = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
@@ -21,12 +23,22 @@ _SPELLED = {
 }  # fmt: skip
 
 
+_ARROWS = {"higher": r" $\uparrow$", "lower": r" $\downarrow$", "": ""}
+
+
 def to_latex(tables: Sequence[tuple[str, Table]], notes: Sequence[str], runs: Sequence[Run] = ()) -> str:
     """Tables for booktabs (\\usepackage{booktabs}); what must be known stands in comments and under the table.
 
     runs    where they are of several data sets (or scenes), methods x data sets is the first table
     """
     blocks = [f"% {_comment(note)}\n" for note in notes]
+    titles = {run.variant: run.title for run in runs}
+
+    def named(text: str) -> str:
+        """Methods as papers write them, in a text about several of them."""
+        keys = "|".join(map(re.escape, sorted(titles, key=len, reverse=True)))
+        return re.sub(rf"(?<![\w/.-])(?:{keys})(?![\w/.-])", lambda found: titles[found[0]], text) if keys else text
+
     overview = methods_by_datasets(runs)
     if overview:
         blocks.append(overview)
@@ -35,16 +47,19 @@ def to_latex(tables: Sequence[tuple[str, Table]], notes: Sequence[str], runs: Se
         align = "".join("l" if c.text or not i else "r" for i, c in enumerate(table.columns))
         best = " Bold: the best of its column." if table.has_best else ""
         lines = [
-            r"\begin{table}", r"  \centering", f"  \\caption{{{_latex(title)}. {_latex(table.caption)}{best}}}",
+            r"\begin{table}", r"  \centering",
+            f"  \\caption{{{_latex(named(title))}. {_latex(named(table.caption))}{best}}}",
             f"  \\label{{{_label(title, labels)}}}", f"  \\begin{{tabular}}{{{align}}}", r"    \toprule",
-            "    " + " & ".join(_latex(c.name) for c in table.columns) + r" \\", r"    \midrule",
+            "    " + " & ".join(_latex(c.name) + _ARROWS[c.better] for c in table.columns) + r" \\", r"    \midrule",
         ]  # fmt: skip
         for row in table.rows:
             if row.emphasis:
                 lines.append(r"    \midrule")
-            lines.append("    " + " & ".join(map(_set, row.cells)) + r" \\")
+            first, *others = row.cells
+            cells = [replace(first, text=titles.get(first.text, first.text)), *others]
+            lines.append("    " + " & ".join(map(_set, cells)) + r" \\")
         lines += [r"    \bottomrule", r"  \end{tabular}"]
-        lines += [f"  \\par\\smallskip\\footnotesize {_latex(_short(note))}" for note in table.notes]
+        lines += [f"  \\par\\smallskip\\footnotesize {_latex(_short(named(note)))}" for note in table.notes]
         blocks.append("\n".join([*lines, r"\end{table}"]) + "\n")
     return "\n".join(blocks)
 
@@ -60,8 +75,10 @@ def methods_by_datasets(runs: Sequence[Run]) -> str:
             groups.append(_of_scene(part))
     if len(groups) < 2:
         return ""
-    keys = list(dict.fromkeys(key for _, _, _, values in groups for key in values))
-    body = [[_latex(variant), _latex(rate or numbers.MISSING)] for variant, rate in keys]
+    at = {(run.variant, run.facts.rate): i for i, run in enumerate(sorted(runs, key=_in_order))}
+    keys = sorted(dict.fromkeys(key for _, _, _, values in groups for key in values), key=at.__getitem__)
+    titles = {run.variant: run.title for run in runs}
+    body = [[_latex(titles[variant]), _latex(rate or numbers.MISSING)] for variant, rate in keys]
     for _, names, directions, values in groups:
         for j, name in enumerate([*names, None]):  # None: the bytes
             column = [values[key][j] if key in values else None for key in keys]
@@ -69,22 +86,30 @@ def methods_by_datasets(runs: Sequence[Run]) -> str:
             for i, value in enumerate(column):
                 text = _latex(numbers.megabytes(value) if name is None else numbers.score(name, value))
                 body[i].append(f"\\textbf{{{text}}}" if i in best else text)
-    heads, rules, at = [], [], 3
+    heads, rules, left = [], [], 3
     for title, names, _, _ in groups:
         heads.append(f"\\multicolumn{{{len(names) + 1}}}{{c}}{{{_latex(title)}}}")
-        rules.append(f"\\cmidrule(lr){{{at}-{at + len(names)}}}")
-        at += len(names) + 1
-    under = [_latex(numbers.heading(name)) if name else "MB" for _, names, _, _ in groups for name in (*names, "")]
+        rules.append(f"\\cmidrule(lr){{{left}-{left + len(names)}}}")
+        left += len(names) + 1
+    under = [
+        _latex(numbers.heading(name)) + _ARROWS[directions[name]] if name else "MB" + _ARROWS["lower"]
+        for _, names, directions, _ in groups for name in (*names, "")
+    ]  # fmt: skip
     lines = [
         r"\begin{table*}", r"  \centering",
         r"  \caption{Methods by data sets: plain means over the scenes. Bold: the best of its column.}",
-        r"  \label{tab:methods-by-datasets}", f"  \\begin{{tabular}}{{ll{'r' * (at - 3)}}}", r"    \toprule",
+        r"  \label{tab:methods-by-datasets}", f"  \\begin{{tabular}}{{ll{'r' * (left - 3)}}}", r"    \toprule",
         "    & & " + " & ".join(heads) + r" \\", "    " + " ".join(rules),
         "    method & rate & " + " & ".join(under) + r" \\", r"    \midrule",
         *("    " + " & ".join(cells) + r" \\" for cells in body),
         r"    \bottomrule", r"  \end{tabular}", r"\end{table*}",
     ]  # fmt: skip
     return "\n".join(lines) + "\n"
+
+
+def _in_order(run: Run) -> tuple[object, ...]:
+    rate = run.facts.rate or ""
+    return natural(run.variant), rate_position(run.facts.method, rate), natural(rate)
 
 
 _Key = tuple[str, str | None]

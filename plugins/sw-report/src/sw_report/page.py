@@ -68,6 +68,11 @@ class PageOptions:
     pictures: bool = True
 
 
+def _unbroken(text: str) -> str:
+    """A mean and its deviation may stand below each other, but a sign stays with its number."""
+    return text.replace(f" {numbers.PLUS_MINUS} ", f" {numbers.PLUS_MINUS}\N{NO-BREAK SPACE}")
+
+
 def write_page(collection: Collection, path: Path, options: PageOptions | None = None) -> None:
     """Write the page about these runs, atomically."""
     write_atomic(path, render_page(collection, options or PageOptions(), path.parent))
@@ -85,6 +90,7 @@ def render_page(collection: Collection, options: PageOptions, folder: Path | Non
         loader=PackageLoader("sw_report"), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
+    environment.filters["unbroken"] = _unbroken
     environment.filters["capfirst"] = lambda text: text[:1].upper() + text[1:]
     loader = environment.loader
     assert loader is not None

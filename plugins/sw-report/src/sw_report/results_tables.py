@@ -7,7 +7,8 @@ from typing import Any
 
 from sw_report import numbers
 from sw_report.aggregate import DatasetTable, MeanRow
-from sw_report.blocks import Cell, Row, Table, columns, row
+from sw_report.bases import STEPS_NOTE, bases_notes
+from sw_report.blocks import Cell, Column, Note, Row, Table, columns, row
 from sw_report.declared import metric_style
 from sw_report.distortion import BdCell, BdTable
 from sw_report.facts import RunFacts, clean
@@ -27,13 +28,13 @@ def metric_names(runs: Iterable[Run], *, diagnostic: bool = False) -> list[str]:
 
 def missing_metrics(runs: Iterable[Run]) -> list[str]:
     """One line for each reason why metrics have no value."""
-    reasons: dict[str, dict[str, None]] = {}
+    reasons: dict[str, dict[str, str]] = {}
     for run in runs:
         for name in numbers.ordered_metrics(run.facts.metrics):
             if run.mean(name) is None and not run.facts.is_diagnostic(name):
                 why = run.facts.unknown.get(f"metrics.{name}.mean", "the record gives no reason")
-                reasons.setdefault(why, {})[numbers.heading(name)] = None
-    return [f"{', '.join(names)}: {why}" for why, names in reasons.items()]
+                reasons.setdefault(why, {})[name] = numbers.heading(name)
+    return [Note(f"{', '.join(names.values())}: {why}", *names) for why, names in reasons.items()]
 
 
 def runs_table(runs: Sequence[Run]) -> Table:
@@ -41,8 +42,12 @@ def runs_table(runs: Sequence[Run]) -> Table:
     names = metric_names(runs)
     several = any(len(run.seeds) > 1 for run in runs)
     heads = [
-        "method", "rate", *(["seeds"] if several else []), *map(numbers.heading, names), "MB", "primitives", "steps",
-        *(head for head, _, _, _ in MEASURED),
+        Column("method", text=True, key="method"), Column("rate", text=True, key="rate"),
+        *([Column("seeds", key="seeds")] if several else []),
+        *(Column(numbers.heading(name), key=name, better=_direction(runs, name)) for name in names),
+        Column("MB", key="size", better="lower"), Column("primitives", key="primitives"), Column("steps", key="steps"),
+        *(Column(head, key=key, better="higher" if key == "fps" else "lower") for (head, *_), key in
+          zip(MEASURED, MEASURED_KEYS, strict=True)),
     ]  # fmt: skip
     marks = machine_marks(runs)
     rows: list[Row] = []
@@ -54,7 +59,7 @@ def runs_table(runs: Sequence[Run]) -> Table:
         cells += [
             Cell(numbers.megabytes(run.size), f"{run.size:,.0f} bytes"),
             numbers.counts({unit: round(n) for unit, n in run.counts.items()}),
-            numbers.count(facts.train.steps),
+            facts.train.all_steps(),
             *(_measured(run, column, marks) for column in MEASURED),
         ]
         rows.append(row(cells))
@@ -71,23 +76,26 @@ def runs_table(runs: Sequence[Run]) -> Table:
     if any("fit" in run.facts.flags for run in runs):
         notes.append("The test views are training views too: scores are quality of fit, not of novel views.")
     notes += uncompressed_notes(run.facts for run in runs)
+    if any(run.facts.train.pretraining for run in runs):
+        notes.append(Note(STEPS_NOTE, "steps"))
+        notes += bases_notes((run.facts for run in runs), {id(run.facts): run.variant for run in runs})
     if several:
         notes.append(numbers.SEEDS_NOTE)
     if any(facts.contended for run in runs for facts in run.seeds):
-        notes.append(numbers.SHARED_NOTE)
+        notes.append(Note(numbers.SHARED_NOTE, *MEASURED_KEYS))
     if marks:
         told = "; ".join(f"{mark} {name}" for name, mark in marks.items())
-        notes.append(f"Times and FPS come from different machines, and are not comparable: {told}.")
+        text = f"Times and FPS come from different machines, and are not comparable: {told}."
+        notes.append(Note(text, *MEASURED_KEYS))
     if bound := sorted({run.facts.method for run in runs if "device-bound" in run.facts.flags}):
         notes.append(f"Device-bound: files of {', '.join(bound)} decode only on the machine that made them.")
-    return Table("Results", columns(heads, text=("method", "rate")), rows, caption, notes, sortable=True)
+    return Table("Results", heads, rows, caption, notes, sortable=True)
 
 
 def uncompressed_notes(runs: Iterable[RunFacts]) -> list[str]:
     """One line for each number format of files that are not compressed."""
-    return [
-        numbers.UNCOMPRESSED_NOTE.format(name) for name in dict.fromkeys(run.uncompressed() for run in runs) if name
-    ]
+    names = dict.fromkeys(run.uncompressed() for run in runs)
+    return [Note(numbers.UNCOMPRESSED_NOTE.format(name), "rate") for name in names if name]
 
 
 MEASURED: tuple[tuple[str, str, Callable[[RunFacts], float | None], Callable[[float | None], str]], ...] = (
@@ -97,6 +105,9 @@ MEASURED: tuple[tuple[str, str, Callable[[RunFacts], float | None], Callable[[fl
     ("FPS", "render", lambda facts: facts.speed.fps, numbers.rate),
 )
 """Values that depend on the machine: head of the column, phase, value, spelling. Training includes the base scene's."""
+
+
+MEASURED_KEYS = ("train", "encode", "decode", "fps")
 
 
 def _direction(runs: Sequence[Run], metric: str) -> str:
@@ -136,8 +147,13 @@ def means_table(table: DatasetTable) -> Table:
     """Plain means over the scenes of a data set."""
     names = list(dict.fromkeys(name for r in table.rows for name in r.metrics))
     several = any(r.seeds > 1 for r in table.rows)
-    heads = ["method", "rate", "scenes", *(["seeds"] if several else []), *map(numbers.heading, names), "MB",
-             "primitives"]  # fmt: skip
+    heads = [
+        Column("method", text=True, key="method"), Column("rate", text=True, key="rate"),
+        Column("scenes", key="scenes"),
+        *([Column("seeds", key="seeds")] if several else []),
+        *(Column(numbers.heading(name), key=name, better=table.directions[name]) for name in names),
+        Column("MB", key="size", better="lower"), Column("primitives", key="primitives"),
+    ]  # fmt: skip
     rows = []
     for r in table.rows:
         of = f"{len(r.scenes)} of {len(table.scenes)}"
@@ -157,7 +173,7 @@ def means_table(table: DatasetTable) -> Table:
         compared[first + len(names)] = ([r.size for r in table.rows], "lower")
         rows = marked(rows, compared)
     return Table(
-        f"Means over {table.title}", columns(heads, text=("method", "rate")), rows,
+        f"Means over {table.title}", heads, rows,
         f"Plain means over {', '.join(table.scenes)}.", means_notes(table), sortable=True,
     )  # fmt: skip
 

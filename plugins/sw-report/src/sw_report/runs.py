@@ -11,6 +11,7 @@ from pathlib import Path
 from splatwizard_core.api import UserInputError
 from splatwizard_core.tooling import FILE_NAME
 from sw_report.configurations import PRESET, configurations, described, differing, seed_of
+from sw_report.declared import method_title, rate_position
 from sw_report.facts import RunFacts, clean, read_facts
 from sw_report.sweeps import sweep_notes
 
@@ -37,6 +38,13 @@ class Run:
     def label(self) -> str:
         """Method and rate point."""
         return f"{self.variant} {self.facts.rate}" if self.facts.rate else self.variant
+
+    @property
+    def title(self) -> str:
+        """The variant with its method's name as papers write it."""
+        method = self.facts.method
+        rest = self.variant.removeprefix(method)
+        return self.variant if rest == self.variant else method_title(method) + rest
 
     @property
     def place(self) -> tuple[str, str]:
@@ -148,7 +156,9 @@ def natural(text: str) -> tuple[tuple[int, int | str], ...]:
 
 def _order(run: Run) -> tuple[object, ...]:
     facts = run.facts
-    return natural(facts.scene), facts.protocol.id, natural(run.variant), run.size, facts.rate or ""
+    rate = facts.rate or ""
+    at = rate_position(facts.method, rate)
+    return natural(facts.scene), facts.protocol.id, natural(run.variant), at, natural(rate), run.size
 
 
 OF_SEEDS = (

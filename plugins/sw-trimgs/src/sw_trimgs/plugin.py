@@ -7,17 +7,17 @@ RATES = ["r1", "r2", "r3", "r4", "r5", "r6"]
 
 @hookimpl
 def register_methods(registry: Registry) -> None:
-    registry.add("flat-3dgs", "sw_trimgs.method:Flat3DGS",
+    registry.add("flat-3dgs", "sw_trimgs.method:Flat3DGS", title="flat 3DGS",
                  summary="3DGS with flat Gaussians: what trim-3dgs starts from",
                  presets=["paper", "quick"], rates=RATES)  # fmt: skip
-    registry.add("trim-3dgs", "sw_trimgs.method:Trim3DGS",
+    registry.add("trim-3dgs", "sw_trimgs.method:Trim3DGS", title="Trim3DGS",
                  summary="flat Gaussians, trimmed by contribution and split by scale (Fan et al. 2024)",
                  presets=["paper", "dtu", "mipnerf360-outdoor", "mipnerf360-indoor", "quick"],
                  rates=RATES)  # fmt: skip
-    registry.add("trim-2dgs", "sw_trimgs.surfel_method:Trim2DGS",
+    registry.add("trim-2dgs", "sw_trimgs.surfel_method:Trim2DGS", title="Trim2DGS",
                  summary="surfels of a 2DGS scene, trimmed by contribution and split by scale (Fan et al. 2024)",
                  presets=["paper", "dtu", "mipnerf360", "tnt", "tnt-large", "quick"], rates=RATES)  # fmt: skip
-    registry.add("trim-2dgs-scratch", "sw_trimgs.surfel_method:Trim2DGSScratch",
+    registry.add("trim-2dgs-scratch", "sw_trimgs.surfel_method:Trim2DGSScratch", title="Trim2DGS, scratch",
                  summary="2DGS that is trimmed and split by scale while it trains (Fan et al. 2024)",
                  presets=["paper", "dtu", "quick"], rates=RATES)  # fmt: skip
 

@@ -27,6 +27,7 @@ from splatwizard_core.tooling import (
     takes_choices,
 )
 
+MOST_IN_A_PAGE = 2
 LOCAL, EVERYWHERE = "127.0.0.1", "0.0.0.0"
 
 
@@ -42,7 +43,8 @@ def _addresses(_context: click.Context, _parameter: click.Parameter, incomplete:
     click.option("--host", default=LOCAL, show_default=True, metavar="ADDRESS", shell_complete=_addresses,
                  help="Address that the server listens on; 0.0.0.0: all of this machine's, open to its network."),
     click.option("--html", "page", type=OUTPUT_FILE, metavar="FILE",
-                 help="Write one HTML file that shows the model offline.  [default: none, but a server]"),
+                 help="Write one HTML file that shows the model offline, or two side by side.  [default: none, but a "
+                 "server]"),
     scene_option, images_option, config_option, set_option, device_option, json_option, debug_option,
 )  # fmt: skip
 @takes_choices
@@ -52,22 +54,29 @@ def view(
     """Look at decoded models in the browser, drawn by this machine; two side by side.
 
     PATH is a .swz, a .ply, a run directory, or a folder with run directories below it. The cameras are those of
-    --scene, else of the run's scene; without either they are made up around the Gaussians. Needs viser:
-    pip install 'sw-viewer[viser]'; --html does not.
+    --scene, else of the run's scene; without either they are made up around the Gaussians. Needs viser,
+    the extra [viser] of sw-viewer; --html does not.
     """
     from sw_viewer.entries import about_page, find_all_entries, fixed_gaussians, open_entry
 
     plugins = load_plugins()
     entries = find_all_entries(paths)
     if page is not None:
-        from sw_viewer.page_file import write_page
+        from sw_viewer.page_file import write_page, write_pair
 
-        if len(entries) != 1:
-            raise click.UsageError(f"--html writes one model, here are {len(entries)}: name a file or a run directory")
-        (entry,) = entries.values()
-        opened = open_entry(entry, chosen, plugins)
-        model, note = fixed_gaussians(opened)
-        write_page(model, page, replace(about_page(opened), note=note), opened.around)
+        if len(entries) > MOST_IN_A_PAGE:
+            raise click.UsageError(
+                f"--html writes one model or two side by side, here are {len(entries)}: name files or run directories"
+            )
+        opened = [open_entry(entry, chosen, plugins) for entry in entries.values()]
+        models = [(model, replace(about_page(each), note=note)) for each in opened
+                  for model, note in [fixed_gaussians(each)]]  # fmt: skip
+        around = next((each.around for each in opened if each.has_scene), opened[0].around)
+        if len(models) == 1:
+            write_page(models[0][0], page, models[0][1], around)
+        else:
+            titled = zip(models, entries, strict=True)
+            write_pair([(model, replace(about, title=label)) for (model, about), label in titled], page, around)
         facts: dict[str, Any] = {"file": str(page), "bytes": page.stat().st_size}
         print_facts(facts, as_json, f"{facts['bytes']:,} bytes: {page}")
         return

@@ -9,6 +9,7 @@ from __future__ import annotations
 import html
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -58,6 +59,27 @@ def write_page(model: SplatModel, path: str | os.PathLike[str], about: About, ar
     """
     packed = pack(model)
     text = _page(packed.text, packed.facts, about, around or surroundings_about(packed.means))
+    with replacing(path) as temporary:
+        Path(temporary).write_text(text, encoding="utf-8")
+
+
+def write_pair(
+    models: Sequence[tuple[SplatModel, About]], path: str | os.PathLike[str], around: Surroundings | None
+) -> None:
+    """Write one page of several models side by side, looked at from one place; complete or absent.
+
+    around  cameras of all of them; None: made up around the first one's Gaussians
+    Raises SceneError as `write_page` does.
+    """
+    frames = []
+    for model, about in models:
+        packed = pack(model)
+        around = around or surroundings_about(packed.means)
+        page = html.escape(_page(packed.text, packed.facts, about, around))
+        frames.append(f'<iframe title="{html.escape(about.title)}" srcdoc="{page}"></iframe>\n')
+    parts = {"TITLE": html.escape(" | ".join(about.title for _, about in models)), "FRAMES": "".join(frames)}
+    pieces = _text("pair.html").split("@TITLE@")
+    text = parts["TITLE"].join(pieces).replace("@FRAMES@", parts["FRAMES"])
     with replacing(path) as temporary:
         Path(temporary).write_text(text, encoding="utf-8")
 

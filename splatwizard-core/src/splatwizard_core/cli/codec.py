@@ -20,16 +20,18 @@ from splatwizard_core.plugins import load_plugins
         help="The file to write.  [default: scene.swz beside SOURCE]",
     ),
     shared.method_option, shared.rate_option, shared.preset_option, shared.config_option, shared.set_option,
+    click.option("--no-psnr", is_flag=True, help="Of a run directory: do not measure the file on the test views."),
     shared.device_option, shared.json_option, shared.debug_option,
 )  # fmt: skip
 @takes_choices
-def encode(source: Path, out: Path | None, as_json: bool, chosen: Choices) -> None:
-    """Encode SOURCE into one .swz file.
+def encode(source: Path, out: Path | None, no_psnr: bool, as_json: bool, chosen: Choices) -> None:
+    """Encode SOURCE into one .swz file; tell how much smaller it is, and its PSNR.
 
     SOURCE is a run directory whose training is finished (its config.toml holds; --rate and --set change values of the
-    codec), or a .ply of explicit Gaussians, for methods that encode such.
+    codec), or a .ply of explicit Gaussians, for methods that encode such. The PSNR is that of a run directory's scene.
     """
     from splatwizard_core.runs.encode import encode_directory, encode_ply
+    from splatwizard_core.runs.measure import measure, opener
 
     plugins, is_run = load_plugins(), source.is_dir()
     target = out or output_file((source if is_run else source.parent) / "scene.swz")
@@ -39,7 +41,15 @@ def encode(source: Path, out: Path | None, as_json: bool, chosen: Choices) -> No
     resolved = chosen.resolve_one(plugins)
     session = open_session(resolved, plugins)
     facts = (encode_directory if is_run else encode_ply)(session, resolved, source, target)
-    told = f"{facts['bytes']:,} bytes in {facts['encode_s']:.2f} s: {target}"
+    of = "its parameters as float32" if is_run else source.name
+    facts["ratio"] = (facts["float32_bytes"] if is_run else source.stat().st_size) / facts["bytes"]
+    ratio = facts["ratio"]
+    told = f"{facts['bytes']:,} bytes, {max(ratio, 1 / ratio):.1f} x {'smaller' if ratio >= 1 else 'larger'} than {of}"
+    if is_run and not no_psnr:
+        measured = measure(session, resolved, opener(target, session), metrics=["psnr"], speed=False)
+        facts["psnr"] = measured["metrics"]["psnr"]["mean"]
+        told += "" if facts["psnr"] is None else f", PSNR {facts['psnr']:.2f} dB on {len(measured['views'])} test views"
+    told += f", in {facts['encode_s']:.2f} s: {target}"
     shared.print_facts({"file": str(target), **facts}, as_json, told)
 
 

@@ -54,9 +54,10 @@ def evaluate(
 ) -> None:
     """Measure FILE on the test views of a scene, by the protocol.
 
-    FILE is a .swz, a .ply, or a run directory: then its trained model without codec, on its own scene. Of a file, the
-    model is opened before the scene is read. --set takes scene keys (resolution, test_every, background, ...), keys of
-    the run (raster.prefer, threads, ...) and settings of metrics (metrics.GROUP.KEY).
+    FILE is a .swz, a .ply, or a run directory: then its trained model without codec. Without --scene the scene is
+    that of the run directory, or of the one that the file lies in. Of a file, the model is opened before the scene is
+    read. --set takes scene keys (resolution, test_every, background, ...), keys of the run (raster.prefer, threads,
+    ...) and settings of metrics (metrics.GROUP.KEY).
     """
     from splatwizard_core.runs.encode import encode_directory, finished_training
     from splatwizard_core.runs.fresh import decode_fresh
@@ -74,7 +75,7 @@ def evaluate(
     elif roundtrip:
         raise click.UsageError("--roundtrip is for a run directory; a file has been encoded already")
     else:
-        resolved = chosen.resolve_without_method()
+        resolved = chosen.of_file(file).resolve_without_method()
     session = open_session(resolved, plugins)
     warn_of_metrics(session, names, resolved.metrics, geometry=geometry, quiet=quiet)
 

@@ -20,6 +20,7 @@ from splatwizard_core.errors import PluginError, TaskError
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.plugins.catalogue import package_of
 from splatwizard_core.plugins.origins import Origins
+from splatwizard_core.plugins.remedies import as_installed
 from splatwizard_core.plugins.strangers_code import exits_are_raised
 from splatwizard_native import FULL, DiskFullError, ForeseenError, shortened
 
@@ -105,12 +106,21 @@ def cli() -> None:
     """
 
 
+class _AsInstalled(logging.Formatter):
+    """Messages whose advice to install something works here."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return as_installed(super().format(record))
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `sw` and return its exit status: 0, 2 wrong input, 1 failure, 130 interrupted."""
     open_streams()
     arguments = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in arguments
-    logging.basicConfig(level=logging.DEBUG if debug else logging.WARNING, format="%(levelname)s: %(message)s")
+    handler = logging.StreamHandler()
+    handler.setFormatter(_AsInstalled("%(levelname)s: %(message)s"))
+    logging.basicConfig(level=logging.DEBUG if debug else logging.WARNING, handlers=[handler])
     for noisy in ("PIL", "torch", "matplotlib"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
     with ended_like_ctrl_c(), exits_are_raised():
@@ -139,6 +149,13 @@ def _report(error: BaseException, arguments: Sequence[str], *, debug: bool) -> i
     if isinstance(error, click.exceptions.NoArgsIsHelpError):
         _say(error.format_message())
         return error.exit_code
+    if isinstance(error, click.NoSuchOption):
+        from splatwizard_core.cli.unknown_option import set_hint
+
+        hint = set_hint(error, arguments)
+        if hint is not None:
+            _say(f"error: {hint}")
+            return error.exit_code
     if isinstance(error, click.ClickException):
         context = getattr(error, "ctx", None)
         hint = f" (`{context.command_path} --help`)" if context is not None and context.command_path != "sw" else ""
@@ -173,4 +190,4 @@ def _culprit(error: BaseException, arguments: Sequence[str]) -> str:
 
 def _say(text: str) -> None:
     with contextlib.suppress(OSError):  # nobody reads it: the exit status must do
-        print(without_orders(shortened(text)), file=sys.stderr, flush=True)
+        print(without_orders(as_installed(shortened(text))), file=sys.stderr, flush=True)

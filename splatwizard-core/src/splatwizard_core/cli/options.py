@@ -13,6 +13,7 @@ from splatwizard_core.cli.complete import KEY, PRESET, RATE, SCENE, name_of
 from splatwizard_core.cli.paths import OUTPUT_FOLDER
 from splatwizard_core.cli.streams import without_orders
 from splatwizard_core.plugins.guards import prints_to_stderr
+from splatwizard_core.plugins.remedies import as_installed
 from splatwizard_native import shortened
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ def _seeds(text: str) -> int | tuple[int, ...]:
 scene_option = click.option(
     "--scene", metavar="SCENE", type=SCENE,
     help="A folder (the format is detected), `dataset/scene` under $SPLATWIZARD_DATA, or a scene that is made on the "
-    "spot, by its name.  [default: such a one]",
+    "spot, by its name.  [default: such a one; of a file, that of its run directory]",
 )  # fmt: skip
 images_option = click.option(
     "--images", metavar="FOLDER",
@@ -134,7 +135,7 @@ def options(*decorators: Callable[[F], F]) -> Callable[[F], F]:
 
 def say(message: str) -> None:
     """Print a line for the user on stderr: stdout holds results only."""
-    click.echo(without_orders(shortened(message)), err=True)
+    click.echo(without_orders(as_installed(shortened(message))), err=True)
 
 
 def print_json(content: Any) -> None:
@@ -177,7 +178,7 @@ def console() -> Console:
             raise BrokenPipeError
 
         def render_str(self, text: str, **options: Any) -> Text:
-            return super().render_str(without_orders(text), **options)
+            return super().render_str(without_orders(as_installed(text)), **options)
 
     # A pipe has no width: 80 columns would break tables that are meant to be searched.
     return SafeConsole(highlight=False, width=None if sys.stdout.isatty() else 160)

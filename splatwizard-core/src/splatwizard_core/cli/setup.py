@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from splatwizard_core.cli.options import say
-from splatwizard_core.errors import ConfigError
+from splatwizard_core.errors import ConfigError, UserInputError
 
 TINY = 500_000  # pixels of all training pictures: the published plans take half an hour of a CPU for nothing
 
@@ -82,7 +82,8 @@ class Choices:
             for method in map(plugins.methods.load, self.method_names(plugins))
             for rate in ([None] if self.rate is None else rate_points(method, self.rate))
         ]
-        return [checked_start(plugins, each) for each in _without_unused_starts(plugins, found)]
+        found = _with_shared_starts(plugins, _without_unused_starts(plugins, found))
+        return [checked_start(plugins, each) for each in found]
 
     def settled(
         self, found: list[ResolvedConfig], plugins: PluginManager, scene: Callable[[ResolvedConfig], Scene],
@@ -101,6 +102,10 @@ class Choices:
                 why = f"the plan scaled down for {pixels:,} training pixels"
                 tell(f"preset quick: {why} (--preset paper runs it in full)")
         tell_data_set_values(found, tell)
+        for each in {each.method: each for each in found}.values():
+            shared = [f"{k}={v}" for k, v in each.pretrained.items() if f"pretrained.{k}" not in each.provenance]
+            if shared:
+                tell(f"{each.method}: the trained scene that it starts from has {', '.join(shared)} too")
         return found
 
     def resolve_one(self, plugins: PluginManager) -> ResolvedConfig:
@@ -130,6 +135,42 @@ class Choices:
             if key not in RESERVED and (key in SCENE_KEYS or field_at(PipelineParams, key) is not None):
                 from_file[key] = value
         return resolve(NoMethod, "paper", sets={**from_file, **values}, scene=self.scene or tables.get("scene"))
+
+    def of_file(self, path: Path, tell: Callable[[str], None] = say) -> Choices:
+        """The same for what looks at a file on a scene: where none is named, that of the file's run directory, as it
+        was read there.
+
+        Raises UserInputError if nothing says whose file it is: on a default scene its numbers would be about nothing.
+        """
+        found = self._scene_of(path)
+        if found is None:
+            return self
+        scene, config = found
+        tell(f"scene {scene}, as in the run directory that {path} lies in (--scene names another)")
+        return replace(self, scene=scene, config_file=self.config_file or str(config))
+
+    def of_start(self, tell: Callable[[str], None] = say) -> Choices:
+        """The same for a training: one that starts from a file, and names no scene, is about that file's scene."""
+        start = Path(str(self.values().get("init", "")))
+        found = self._scene_of(start) if start.is_file() else None
+        if found is None:
+            return self
+        tell(f"scene {found[0]}, that of the run directory that {start} lies in (--scene names another)")
+        return replace(self, scene=found[0])
+
+    def _scene_of(self, path: Path) -> tuple[str, Path] | None:
+        """The scene and the config.toml of the run directory that a file lies in; None: a scene is named."""
+        from splatwizard_core.runs.config import read_config_file
+
+        if self.scene is not None or (self.config_file and "scene" in read_config_file(self.config_file)):
+            return None
+        config = path.absolute().parent / "config.toml"
+        scene = read_config_file(config).get("scene") if config.is_file() else None
+        if not isinstance(scene, str) or not scene:
+            raise UserInputError(
+                f"nothing says which scene {path} is of (no config.toml of a run lies beside it): name it by --scene"
+            )
+        return scene, config
 
     def with_rate_of(self, directory: Path, plugins: PluginManager) -> Choices:
         """The same for a run directory: its config.toml, with what another rate point would change in it."""
@@ -195,6 +236,21 @@ def _without_unused_starts(plugins: PluginManager, found: list[ResolvedConfig]) 
     return found
 
 
+def _with_shared_starts(plugins: PluginManager, found: list[ResolvedConfig]) -> list[ResolvedConfig]:
+    """Let what --set and --config say of several methods also train the scenes that some of them start from."""
+    from splatwizard_core.runs.pretrained import for_starts
+
+    if len({each.method for each in found}) < 2:
+        return found
+    settled = []
+    for each in found:
+        layers = ("preset ", "data set ", "rate ")
+        given = [key for key, source in each.provenance.items() if not source.startswith(layers)]
+        more = {key.removeprefix("pretrained."): value for key, value in for_starts(plugins, each, given).items()}
+        settled.append(replace(each, pretrained={**more, **each.pretrained}))
+    return settled
+
+
 def open_session(resolved: ResolvedConfig, plugins: PluginManager) -> Session:
     """Threads and device as asked. Raises PluginError or ConfigError for a choice of rasterizers that is none here,
     CapabilityError for the device."""
@@ -216,6 +272,7 @@ def open_training_session(chosen: Choices, plugins: PluginManager) -> tuple[list
     """
     from splatwizard_core.runs.device import device_reason
 
+    chosen = chosen.of_start()
     resolved = chosen.resolve(plugins)
     _warn_of_equal_rates(resolved)
     session = open_session(resolved[0], plugins)

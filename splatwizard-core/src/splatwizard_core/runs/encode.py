@@ -72,6 +72,7 @@ def encode(
         raise SplatwizardError(f"method '{method.name}' changed the model while encoding it, which it may not")
     return {
         "encode_s": seconds,
+        "float32_bytes": 4 * sum(values.numel() for values in model.parameters()),
         "contended": contended,
         "bytes": size,
         "sha256": file_sha256(path),

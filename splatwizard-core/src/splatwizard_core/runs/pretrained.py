@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import os
 import re
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -76,6 +77,24 @@ def useful_starts(plugins: PluginManager, resolved: ResolvedConfig) -> set[str]:
     if first_scene(method) is not None:
         return {"init", "pretrained"}
     return {"pretrained"} if named_scenes(method) else set()
+
+
+def for_starts(plugins: PluginManager, resolved: ResolvedConfig, keys: Iterable[str]) -> dict[str, Any]:
+    """Map `pretrained.KEY` to the value of a key, for those that the trainings of all scenes that it starts from have.
+
+    keys    of values that were given for several methods alike: then the scenes that some of these methods start from
+            are trained by them too, as the one that stands beside them in a table is
+    Without those that only encode, and those for which the configuration says `pretrained.KEY` itself.
+    """
+    method = make_method(plugins, resolved)
+    first = first_scene(method) if resolved.init else None
+    bases = [plugins.methods.load(name).Config for name in named_scenes(method) if name != first]
+    return {
+        f"pretrained.{key}": value_at(resolved.config, key)
+        for key in keys
+        if bases and key not in resolved.pretrained and field_at(type(resolved.config), key) is not None
+        and all(field_at(b, key) is not None and key.partition(".")[0] not in b.ENCODING for b in bases)
+    }  # fmt: skip
 
 
 def checked_start(plugins: PluginManager, resolved: ResolvedConfig) -> ResolvedConfig:

@@ -280,7 +280,7 @@ def undistort(scene: str, out: Path, images: str, quality: int, as_json: bool) -
     """Write a copy of the COLMAP scene SCENE without lens distortion into the new folder OUT: pinhole cameras, the
     same poses, points and image names, pictures (and masks) resampled and cut so that no black border is left.
 
-    Needs the package pycolmap: pip install 'sw-datasets[pycolmap]'.
+    Needs the package pycolmap, the extra [pycolmap] of sw-datasets.
     """
     from sw_datasets.undistort import undistort_scene
 

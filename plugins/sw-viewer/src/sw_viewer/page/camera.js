@@ -24,6 +24,16 @@ class Eye {
     this.changed();
   }
 
+  get place() {
+    const { camera, axes, eye, pivot, zoom } = this;
+    return { camera, axes, eye, pivot, zoom };
+  }
+
+  take(place) {  // of another page's eye
+    Object.assign(this, place);
+    this.changed();
+  }
+
   get pose() {
     return { R: this.axes.flat(), tau: this.axes.map(axis => -dot(axis, this.eye)), eye: this.eye };
   }

@@ -21,7 +21,15 @@ async function begin() {
   worker.postMessage({ means: gaussians.means }, [gaussians.means.buffer]);
 
   let sorting = 0, number = 0, wanted = false, drawing = 0, share = 1, last = 0, rest = 0, ordered = false;
-  const eye = new Eye(facts, () => { wanted = true; again(); });
+  let hearing = true;  // also until the eye is there
+  const eye = new Eye(facts, () => { wanted = true; again(); if (!hearing) parent.postMessage(eye.place, '*'); });
+  hearing = parent === window;
+  if (!hearing) addEventListener('message', ({ data, source }) => {  // beside another model: both look from one place
+    if (source !== parent || !data.axes) return;
+    hearing = true;
+    eye.take(data);
+    hearing = false;
+  });
 
   function sort() {  // one order at a time; the newest place is asked for when it is there
     if (sorting || !wanted) return;
