@@ -91,6 +91,17 @@ def test_keys_go_to_method_run_and_scene_options():
     assert (found.scene.resolution, found.scene.test_every, found.scene.split) == (4, 5, "all")
 
 
+def test_a_file_of_names_is_told_by_its_whole_path_and_no_file_stands_in_for_a_rule(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for name in ("all", "file", "held_out.txt"):
+        Path(name).write_text("a.png")
+    assert [resolved(f"split={name}").scene.split for name in ("all", "file", "every8")] == ["all", "file", "every8"]
+    for name in ("held_out.txt", "~/held_out.txt"):
+        assert resolved(f"split={name}").scene.split == str(tmp_path / "held_out.txt")
+    assert resolved("split=~nobody-of-this-name/list.txt").scene.split == "~nobody-of-this-name/list.txt"
+
+
 def test_equal_bits_on_a_gpu_are_another_training_and_leave_the_hashes_of_older_runs():
     plain, same = resolved(scene="x"), resolved("deterministic=true", scene="x")
     assert "deterministic" not in plain.as_dict()["pipeline"]
