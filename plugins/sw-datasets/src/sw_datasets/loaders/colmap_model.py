@@ -164,9 +164,15 @@ def count_images(folder: Path) -> int:
     except OSError:
         pass
     try:
-        return len(_text_lines(folder / "images.txt")) // 2
+        lines = iter(_split_lines(folder / "images.txt"))
     except SceneError:
         return 0
+    count = 0
+    for line in lines:
+        if line.strip() and not line.lstrip().startswith("#"):
+            count += 1
+            next(lines, None)  # its keypoints, on a line that may be empty
+    return count
 
 
 def read_cameras(path: Path) -> dict[int, ColmapCamera]:
