@@ -22,7 +22,11 @@ HEAD = (
 )  # fmt: skip
 
 
-def table(scene: str, records_at: Path = RECORDS) -> str:
+BRIEF = {"method": 0, "rate": 1, "PSNR dB": 3, "published": 2, "bytes": 9, "published bytes": 8, "n": 12}
+"""Column of the short form -> its place in a whole row."""
+
+
+def table(scene: str, records_at: Path = RECORDS, *, brief: bool = False) -> str:
     """Write a row for each published figure with records. Raises SystemExit for a scene of no data set."""
     if scene not in SCENES:
         raise SystemExit(f"no published scene is known for '{scene}'; one of {', '.join(SCENES)}")
@@ -32,8 +36,11 @@ def table(scene: str, records_at: Path = RECORDS) -> str:
     order = list(TITLES)
     figures.sort(key=lambda f: (order.index(f.method) if f.method in order else len(order), -(f.bytes or 0)))
     rows = [_row(figure, group, records) for figure in figures if (group := _group(figure, records))]
-    lines = [f"| {' | '.join(cells)} |" for cells in (HEAD, *rows)]
-    return "\n".join([lines[0], "|---" * len(HEAD) + "|", *lines[1:], ""])
+    whole: Sequence[Sequence[str]] = [HEAD, *rows]
+    if brief:
+        whole = [list(BRIEF), *([row[place] for place in BRIEF.values()] for row in rows)]
+    lines = [f"| {' | '.join(cells)} |" for cells in whole]
+    return "\n".join([lines[0], "|---" * len(whole[0]) + "|", *lines[1:], ""])
 
 
 def _group(figure: Figure, records: Rows) -> Rows:

@@ -6,7 +6,8 @@
 
 A table stands between `<!-- table NAME SCENE -->` and `<!-- end -->` and is wholly written by this script; SCENE is a
 file docs/records/SCENE.jsonl, of `table trainers` docs/records/trainers/SCENE.jsonl; `table claims all` looks at the
-scenes that a claim names, and `table published SCENE` at the published figures of sw-report too. Between
+scenes that a claim names, `table published SCENE` and its short form `table published-brief SCENE` at the published
+figures of the methods' packages too. Between
 `<!-- plot SCENE -->` and `<!-- end -->` stands docs/images/rd-SCENE.svg. Values are means over the runs ± the deviation
 of the sample (n - 1).
 """
@@ -141,8 +142,8 @@ def table(name: str, scene: str, records_at: Path = RECORDS) -> str:
         return trainer_records.table(records_at / "trainers" / f"{scene}.jsonl")
     if name == "claims":
         return result_claims.table(records_at)
-    if name == "published":
-        return result_published.table(scene, records_at)
+    if name in ("published", "published-brief"):
+        return result_published.table(scene, records_at, brief=name == "published-brief")
     if name == "plot":
         return result_plots.shown(scene, records_at)
     if name not in TABLES:
