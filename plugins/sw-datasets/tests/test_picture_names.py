@@ -7,7 +7,6 @@ import unicodedata
 
 import pytest
 from PIL import Image
-from sw_datasets.loaders.colmap_model import count_images, read_images
 from sw_datasets.picture_names import find_pictures, view_name
 
 from splatwizard_core.errors import SceneError
@@ -136,12 +135,6 @@ def test_of_several_models_the_largest_is_read_unless_one_is_the_first(colmap_fo
     scene = load(root)
     assert len(scene.train) + len(scene.test) == 3
     assert any("there is also sparse/1 (3 images), sparse/2 (10 images)" in w for w in scene.warnings)
-
-
-def test_images_of_a_text_model_without_keypoints_are_counted(tmp_path):
-    lines = "".join(f"{i} 1 0 0 0 0 0 0 1 {i}.png\n\n" for i in range(3)) + "3 1 0 0 0 0 0 0 1 3.png\n1.5 2.5 -1"
-    (tmp_path / "images.txt").write_text(f"# IMAGE_ID ...\n{lines}")
-    assert count_images(tmp_path) == len(read_images(tmp_path / "images.txt")) == 4
 
 
 def test_points_of_a_ply_serve_where_the_model_has_none(colmap_folder, load):
