@@ -131,6 +131,7 @@ def make(run: Run, args: argparse.Namespace, gpus: queue.Queue[str]) -> Run:
         options += ["--set", "checkpoint_every=1000000000", "--set", f"threads={args.threads}"]
         digests = run.folder / "digests.jsonl"
         run.folder.mkdir(parents=True, exist_ok=True)
+        digests.unlink(missing_ok=True)  # of an earlier command with the same --out
         train = ["train", *options, "--fresh", "--out", str(run.folder)]
         status, run.output = call([sys.executable, __file__, "train", str(digests), str(args.every), *train], gpu)
         directory = run.directory()

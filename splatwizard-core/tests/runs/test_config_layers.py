@@ -74,6 +74,17 @@ def test_each_layer_wins_over_the_one_before(tmp_path: Path):
     assert both.provenance["clamp_render"] == "preset 'quick'"
 
 
+def test_a_file_of_names_is_told_by_its_whole_path_and_no_file_stands_in_for_a_rule(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for name in ("all", "file", "held_out.txt"):
+        Path(name).write_text("a.png")
+    assert [resolved(f"split={name}").scene.split for name in ("all", "file", "every8")] == ["all", "file", "every8"]
+    for name in ("held_out.txt", "~/held_out.txt"):
+        assert resolved(f"split={name}").scene.split == str(tmp_path / "held_out.txt")
+    assert resolved("split=~nobody-of-this-name/list.txt").scene.split == "~nobody-of-this-name/list.txt"
+
+
 def test_the_demo_scene_means_the_quick_preset_and_any_other_the_paper():
     assert resolved().preset == "quick"
     assert resolved(scene="demo:tiny").preset == "quick"

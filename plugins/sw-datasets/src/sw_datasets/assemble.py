@@ -126,7 +126,7 @@ def split_file(split: str, scene: Path | None) -> Path | None:
     """The file of names that a split is, where it is no rule: as it is, or in the scene's folder."""
     if is_rule(split):
         return None
-    places = [Path(split).expanduser(), *([scene / split] if scene is not None else [])]
+    places = [Path(os.path.expanduser(split)), *([scene / split] if scene is not None else [])]
     return next((place for place in places if os.path.isfile(place)), None)
 
 

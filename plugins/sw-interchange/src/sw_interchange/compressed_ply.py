@@ -28,6 +28,7 @@ PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 WIDTHS = (11, 10, 11)
 """Bits of x, y and z, of which x is highest."""
 LARGEST_SCALE = 20.0
+COARSE_COLOUR = 0.05  # of full brightness: a larger error is seen
 
 Words = npt.NDArray[np.uint32]
 
@@ -166,16 +167,17 @@ def _tell_loss(kind: str, span: Array, chunk: npt.NDArray[np.int64], scene: Gaus
 
     span    [chunks,3] greatest minus least value
     """
-    levels = np.array([(1 << (8 if kind == "colours" else bits)) - 1 for bits in WIDTHS], np.float64)
-    steps = span / levels
+    if kind == "log_scales":
+        return  # within 20 of 0 they lose a fiftieth at the most
     if kind == "means":
-        report.coarse(steps[chunk], scene.means, scene.log_scales)
+        levels = np.array([(1 << bits) - 1 for bits in WIDTHS], np.float64)
+        report.coarse((span / levels)[chunk], scene.means, scene.log_scales)
         return
-    name, limit = ("scales", 0.1) if kind == "log_scales" else ("colours", 0.05)
-    coarse = (steps.max(axis=1) / 2 > limit)[chunk]
+    steps = span / 255
+    coarse = (steps.max(axis=1) / 2 > COARSE_COLOUR)[chunk]
     if coarse.any():
         report.warnings.append(
-            f"{name} of {int(coarse.sum()):,} of {len(chunk):,} Gaussians lose up to "
+            f"colours of {int(coarse.sum()):,} of {len(chunk):,} Gaussians lose up to "
             f"{steps.max() / 2:.2g}: outliers widen the range of their chunks of {CHUNK}"
         )
 

@@ -83,8 +83,6 @@ def _beside_published(folders: tuple[str, ...], own: bool, as_json: bool) -> Non
 
 
 def _compared(a: Path, b: Path, camera_file: Path | None, chosen: Choices) -> dict[str, Any]:
-    import torch
-
     from splatwizard_core.api import GaussianModel, UserInputError
     from splatwizard_core.tooling import load_plugins, open_session
     from sw_report.attribute_errors import attribute_errors
@@ -104,8 +102,7 @@ def _compared(a: Path, b: Path, camera_file: Path | None, chosen: Choices) -> di
     resolved = of_runs[0] if of_runs else chosen.resolve_without_method()
     session = open_session(resolved, load_plugins())
     scene = session.scene(resolved) if chosen.scene is not None or configs else None
-    background = torch.zeros(3) if scene is None else scene.background
-    left, right = (open_file(path, session, resolved, background) for path in (a, b))
+    left, right = (open_file(path, session, resolved, scene) for path in (a, b))
     test = [] if scene is None or camera_file is not None else scene.test
     places = [view.camera for view in test] or _places(camera_file, left, right)
     seen_from = f"test views of {scene.name}" if scene is not None and test else "around the Gaussians"

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import torch
 from sw_gaussians.picture_psnr import capped_psnr
 from torch import Tensor
 
-from splatwizard_core.api import Camera, GaussianModel, RasterOptions, SplatModel, UserInputError, track
+from splatwizard_core.api import Camera, GaussianModel, RasterOptions, SplatModel, UserInputError, placed_in, track
 from splatwizard_core.tooling import (
     NegotiatedRasterizer,
     ResolvedConfig,
@@ -23,7 +24,7 @@ from splatwizard_core.tooling import (
 )
 
 if TYPE_CHECKING:
-    from splatwizard_core.api import View
+    from splatwizard_core.api import Scene, View
 
 
 @dataclass(frozen=True)
@@ -52,8 +53,11 @@ class OpenedFile:
         }  # fmt: skip
 
 
-def open_file(path: Path, session: Session, resolved: ResolvedConfig, background: Tensor) -> OpenedFile:
-    """Open a file of any format or method, or the file of a run directory. Raises UserInputError, BitstreamError."""
+def open_file(path: Path, session: Session, resolved: ResolvedConfig, scene: Scene | None) -> OpenedFile:
+    """Open a file of any format or method, or the file of a run directory. Raises UserInputError, BitstreamError.
+
+    scene   about whose origin and on whose background it is drawn; None: as it stands, on black
+    """
     if path.is_dir():
         path = path / "scene.swz"
         if not path.is_file():
@@ -68,8 +72,11 @@ def open_file(path: Path, session: Session, resolved: ResolvedConfig, background
         model, reader = open_model(path, plugins, session.device)
         kind, raster = reader.method, reader.raster
     model.check_finite()
+    if scene is not None:
+        placed_in(model, scene, path.name)
     model.prepare()
     rasterizer = session.rasterizer(resolved, suggested_rasterizers(raster))
+    background = torch.zeros(3) if scene is None else scene.background
     return OpenedFile(path, kind, model, rasterizer, render_options(raster, background.to(session.device)))
 
 

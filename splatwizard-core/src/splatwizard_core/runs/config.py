@@ -309,8 +309,9 @@ def resolve(
         reading = apply_overrides(reading, given[SceneParams], source=source)
     config = config.completed(plugins, provenance)
     reading_values = reading.model_dump()
-    if reading_values["split"] is not None and os.path.isfile(reading_values["split"]):
-        reading_values["split"] = os.path.abspath(reading_values["split"])  # other processes have other folders
+    split = os.path.expanduser(reading_values["split"] or "")
+    if split not in ("all", "file") and os.path.isfile(split):  # a file of such a name is not meant
+        reading_values["split"] = os.path.abspath(split)  # other processes have other folders
     scene_options = SceneOptions(**reading_values, seed=ppl.seed)
     return ResolvedConfig(
         method.name, preset, rate, scene_spec, config, ppl, scene_options, given_values(config, plugins), provenance,

@@ -89,11 +89,11 @@ class Protocol:
     dataset     name of the family, or of a data set of the user's own
     images      picture folder
     resolution  the rule of specs: -1, 1, 2, 4, 8 or a width
-    split       "every<n>", "lod:<k>", "file", "all"
+    split       "every<n>", "lod:<k>", "file", "all", or "names-<hash>" of lists of names
     background  "black" or "white"
     principal_point "center" or "file" (COLMAP's own)
     quantize8   renders are rounded to 8 bit before metrics
-    masked      pictures of a COLMAP scene were cut out by their alpha
+    masked      pictures were cut out by alpha or mask, beyond what the layout always does
     composite8  pictures with alpha were composited in 8 bit with truncation
     name        "survey" or "inria" where all of the above is what that named protocol says of a published scene, else
                 "custom"; equal facts are comparable whatever the name, so it is no part of the id

