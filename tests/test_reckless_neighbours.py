@@ -6,7 +6,6 @@ Installed distributions as in tests/test_hostile_plugins.py, through the command
 from __future__ import annotations
 
 import json
-import time
 from pathlib import Path
 
 import pytest
@@ -38,19 +37,18 @@ def lines_about(name: str, text: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def listing(tmp_path_factory: pytest.TempPathFactory):
-    """`sw list-plugins --json` beside all that register recklessly, and the seconds that it took."""
+    """`sw list-plugins --json` beside all that register recklessly."""
     site = Site(tmp_path_factory.mktemp("street"))
     for name, (source, _) in {**IMPORTS, **BROKEN}.items():
         good = metric(f"of-{name}", name.replace("-", "_")) if name in IMPORTS else ""
         site.install(name, f"{source}\n{good}")
-    began = time.monotonic()
     done = site.sw("list-plugins", "--json")
-    return done, Listed(json.loads(done.stdout)), time.monotonic() - began
+    return done, Listed(json.loads(done.stdout))
 
 
 @pytest.mark.parametrize("name", IMPORTS)
 def test_what_registering_changes_is_put_back_and_told_once(listing, name):
-    done, listed, _ = listing
+    done, listed = listing
     (line,) = lines_about(name, done.stderr)
     assert IMPORTS[name][1] in line
     assert listed.of(name)["error"] is None
@@ -59,13 +57,13 @@ def test_what_registering_changes_is_put_back_and_told_once(listing, name):
 
 @pytest.mark.parametrize("name", BROKEN)
 def test_one_that_does_not_come_back_from_registering_is_broken(listing, name):
-    _, listed, _ = listing
+    _, listed = listing
     assert BROKEN[name][1] in listed.of(name)["error"]
 
 
-def test_waiting_ends_after_seconds_and_stdout_holds_the_json_alone(listing):
-    done, _, seconds = listing
-    assert seconds < 30  # two wait for 3 s each, where they would for ten minutes and for ever
+def test_stdout_holds_the_json_alone(listing):
+    """And waiting has ended: one would sleep for longer than a command may take, one for ever."""
+    done, _ = listing
     assert "rubbish" in done.stderr
 
 
