@@ -21,7 +21,7 @@ IMPORTS = {
     "sw-silences": ("import logging\nlogging.disable(logging.CRITICAL)\n", "changes how much is logged"),
     "sw-handlers": ("import logging\nlogging.root.handlers.clear()\n", "changes who writes what is logged"),
     "sw-thread": (
-        "import threading, time\nthreading.Thread(target=time.sleep, args=(600,), name='their thread').start()\n",
+        "import threading, time\nthreading.Thread(target=time.sleep, args=(3600,), name='their thread').start()\n",
         "starts a thread (their thread)",
     ),
 }
@@ -29,7 +29,7 @@ IMPORTS = {
 
 LATE = "registering takes more than 3 s"
 BROKEN = {
-    "sw-sleeps": ("import time\ntime.sleep(600)\n", LATE),
+    "sw-sleeps": ("import time\ntime.sleep(3600)\n", LATE),
     "sw-hook-waits": (hook("register_metrics", "import threading", "threading.Event().wait()"), LATE),
     "sw-kbd": ("raise KeyboardInterrupt\n", "it raises KeyboardInterrupt"),
     "sw-generator-exit": ("raise GeneratorExit('odd')\n", "it raises GeneratorExit odd"),

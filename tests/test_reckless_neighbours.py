@@ -37,7 +37,7 @@ def lines_about(name: str, text: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def listing(tmp_path_factory: pytest.TempPathFactory):
-    """`sw list-plugins --json` beside all that register recklessly; it ends, or its time limit of minutes does."""
+    """`sw list-plugins --json` beside all that register recklessly."""
     site = Site(tmp_path_factory.mktemp("street"))
     for name, (source, _) in {**IMPORTS, **BROKEN}.items():
         good = metric(f"of-{name}", name.replace("-", "_")) if name in IMPORTS else ""
@@ -62,6 +62,7 @@ def test_one_that_does_not_come_back_from_registering_is_broken(listing, name):
 
 
 def test_stdout_holds_the_json_alone(listing):
+    """And waiting has ended: one would sleep for longer than a command may take, one for ever."""
     done, _ = listing
     assert "rubbish" in done.stderr
 
