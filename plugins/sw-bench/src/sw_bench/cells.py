@@ -304,7 +304,9 @@ def differing_bases(cells: Sequence[Cell], plugins: PluginManager) -> list[str]:
 
 
 def _flat(resolved: ResolvedConfig) -> dict[str, Any]:
-    return flattened(resolved.training_content()["config"])
+    """Return the values that its training reads, by dotted key."""
+    values = resolved.config.model_dump(mode="json")
+    return flattened({key: value for key, value in values.items() if key not in type(resolved.config).ENCODING})
 
 
 def _shared_job(key: tuple[int, str], resolved: ResolvedConfig, layout: Layout) -> Job:
