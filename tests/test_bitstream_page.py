@@ -15,7 +15,7 @@ from bitstream_page import container as page_container
 from bitstream_page import entropy_coders, entropy_models, method_files, positions
 
 from splatwizard_core.cli.main import main
-from splatwizard_core.coding import container
+from splatwizard_core.coding import container, limits
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.runs.decode import open_model
 from splatwizard_native import strict_json
@@ -93,7 +93,7 @@ def test_the_page_states_the_caps_of_the_code():
     assert (
         f"{container.MAX_HEADER >> 10} KiB, {strict_json.MAX_DEPTH} levels, {container.MAX_SECTIONS:,} sections" in text
     )
-    assert f"{container.FREE >> 20} MiB + {container.EXPANSION:,} for each byte of the file" in text
+    assert f"{limits.FREE >> 20} MiB + {limits.EXPANSION:,} for each byte of the sections" in text
     points = (
         f"above 2^{point_limit.ALWAYS_ALLOWED.bit_length() - 1} at most {point_limit.POINTS_PER_BYTE} for each byte"
     )

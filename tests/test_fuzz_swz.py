@@ -64,7 +64,8 @@ def decode_file(path: Path):
     """What came of a file; an AssertionError if it decodes to nonsense."""
     model, reader = open_model(path, load_plugins(), CPU)
     reader.summary()
-    assert all(reader.static[name] == number for name, number in model.counts().items())
+    # Fewer than declared where rows mean nothing: those are left out.
+    assert all(reader.static[name] >= number for name, number in model.counts().items())
     if "quantized" in (reader.static.get("mode"), str(reader.static.get("codec")).removeprefix("gaussians-")):
         assert all(bool(torch.isfinite(parameter).all()) for parameter in model.parameters())
     return "decoded"

@@ -154,7 +154,7 @@ def test_a_rasterizer_of_a_stranger_draws_for_nobody_who_did_not_ask(run, record
     }
     assert drawn
     assert not drawn & {"boaster", "lightning", "exits", "lies"}
-    assert "warning: native module sw_no_kernels:MODULE cannot be imported: SystemExit: 0" in run.stderr
+    assert "sw_no_kernels" not in run.stderr  # modules are loaded where they are used
 
 
 def test_hooks_around_a_run_fail_alone(run):

@@ -202,6 +202,4 @@ def test_pages_give_no_advice_that_needs_an_index_of_ours():
 def test_the_small_torch_of_the_readme_is_the_pinned_one():
     pinned = re.search(r"^torch==(\S+)$", (ROOT / "constraints.txt").read_text("utf-8"), re.M)
     assert pinned is not None
-    assert f"CPU build of torch=={pinned[1]}" in (ROOT / "README.md").read_text(
-        "utf-8"
-    )
+    assert f"CPU build of torch=={pinned[1]}" in (ROOT / "README.md").read_text("utf-8")

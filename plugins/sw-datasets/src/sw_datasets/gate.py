@@ -158,7 +158,7 @@ class Gate:
         return bool(self.cut["mask"] or (self.cut["alpha"] and not self.always_cut))
 
     def warnings(self) -> list[str]:
-        """What was done, and what was found and not used, a line each."""
+        """List what was done, and what was found and not used, a line each."""
         seen, background = self.seen, self.rules.background
         found = []
         if count := seen["turned"]:

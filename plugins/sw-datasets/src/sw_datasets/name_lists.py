@@ -107,7 +107,7 @@ def split_by_lists(views: Sequence[View], lists: NameLists) -> tuple[list[View],
 
 
 def lists_id(train: Sequence[View], test: Sequence[View]) -> str:
-    """What a protocol id says of such a split: a hash of the names in either half, whatever file they came from."""
+    """Return the part of a protocol id for such a split: a hash of the names in either half, whatever their file."""
     content = [sorted(name_key(view.name) for view in part) for part in (train, test)]
     return f"names-{hashlib.sha256(json.dumps(content).encode()).hexdigest()[:12]}"
 

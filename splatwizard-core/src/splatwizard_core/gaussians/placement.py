@@ -1,4 +1,4 @@
-"""Where a model stands: about the local origin of a georeferenced scene, or in the world of the scene's files."""
+"""Place of a model: about the local origin of a georeferenced scene, or in the world of the scene's files."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ AS_WORLD = "as_world"
 
 
 def origin_of(model: SplatModel) -> Origin | None:
-    """Where the origin of a model's coordinates lies in the world, as its file says; None where it does not say."""
+    """Return where the origin of a model's coordinates lies in the world, as its file says; else None."""
     return as_origin(getattr(model, "origin", {}).get(WORLD_ORIGIN))
 
 
@@ -90,5 +90,5 @@ def in_world(model: SplatModel, name: str) -> SplatModel:
 
 
 def world_shift(model: SplatModel) -> Origin | None:
-    """What an exporter adds to the coordinates: the world's origin, if world coordinates are asked for."""
+    """Return what an exporter adds to the coordinates: the world's origin, if world coordinates are asked for."""
     return origin_of(model) if getattr(model, "origin", {}).get(AS_WORLD) else None
