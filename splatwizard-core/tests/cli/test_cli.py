@@ -51,7 +51,7 @@ def test_help_and_list_plugins_import_no_torch(arguments: list[str]):
 
 @pytest.mark.parametrize("arguments", [["--help"], ["list-plugins"]])
 def test_help_and_list_plugins_take_little_more_than_the_libraries_they_stand_on(arguments: list[str]):
-    """By lines of Python: about 5 and 6.5 times as many, requirements read and held included; torch would make it 20."""
+    """By lines of Python: about 5 and 6.5 times as many, reading requirements included; torch would make it 20."""
     libraries, _ = lines_of_process("import click, pluggy, importlib.metadata as m; list(m.distributions())")
     run = "import runpy; runpy.run_module('splatwizard_core', run_name='__main__', alter_sys=True)"
     assert lines_of_process(run, *arguments)[0] < 8 * libraries
