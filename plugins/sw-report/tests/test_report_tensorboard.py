@@ -12,6 +12,7 @@ from sw_report import plugin
 from sw_report.tensorboard_log import TensorBoardLog
 
 from splatwizard_core.api import CapabilityError
+from splatwizard_core.training.identity import given_values
 from splatwizard_core.training.params import LogParams, PipelineParams
 
 
@@ -84,9 +85,10 @@ def test_without_the_package_it_is_named(monkeypatch, tmp_path):
         TensorBoardLog(tmp_path)
 
 
-def test_a_configuration_without_the_key_is_as_it_was():
-    assert "log" not in PipelineParams().model_dump()
-    assert PipelineParams(log=LogParams(tensorboard=True)).model_dump()["log"] == {"tensorboard": True, "view": 0}
+def test_a_training_is_the_same_whether_it_is_logged_or_not():
+    logged = PipelineParams(log=LogParams(tensorboard=True))
+    assert given_values(logged) == given_values(PipelineParams())
+    assert logged.model_dump()["log"] == {"tensorboard": True, "view": 0}
 
 
 def test_tensorboards_own_library_reads_what_was_written(tmp_path):

@@ -60,7 +60,9 @@ METRIC: dict[str, Rule] = {
     "diagnostic": FLAG, "slow": FLAG, "unrounded": FLAG, "over": OVER,
 }  # fmt: skip
 FIELDS: Mapping[str, Mapping[str, Rule]] = {
-    "method": {"presets": NAMES, "rates": NAMES, "bd_anchor": COUNT, "default": FLAG, "published": FIGURES},
+    "method": {
+        "presets": NAMES, "rates": NAMES, "bd_anchor": COUNT, "default": FLAG, "published": FIGURES, "title": TEXT,
+    },
     "metric": METRIC,
     "coder": {"codes": CODES, "available": WHERE, "stores": TEXT},
     "exporter": {"suffix": SUFFIX},
