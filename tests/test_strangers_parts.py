@@ -134,7 +134,8 @@ def test_a_part_that_is_not_there_is_told_with_its_package(site, records, tmp_pa
     shutil.copy(file_of(site, "chosen"), tmp_path / "scene.swz")
     done = nobody.sw("decode", "scene.swz", check=False)
     assert done.returncode == 2
-    assert "needs coder 'plain-points', which is not installed: pip install 'sw-parts>=0.1'" in done.stderr
+    assert "needs coder 'plain-points', which is not installed: " in done.stderr
+    assert "pip install 'sw-parts>=0.1' (the package that the file names)" in done.stderr
 
 
 @pytest.mark.parametrize(
