@@ -118,9 +118,9 @@ def test_names_without_a_view_are_counted_and_names_of_two_views_refused(colmap_
 
 def test_what_is_no_file_is_an_unknown_rule_and_no_text_is_refused(colmap_folder, load, tmp_path):
     root = colmap_folder.write()
-    with pytest.raises(SceneError, match=r"unknown split 'held_out\.txt': use .* or a file of names"):
+    with pytest.raises(SceneError, match=r"split: held_out\.txt: there is no such file of names"):
         load(root, split="held_out.txt")
-    with pytest.raises(SceneError, match="unknown split '~nobody-of-this-name/list"):
+    with pytest.raises(SceneError, match="split: ~nobody-of-this-name/list.*there is no such file"):
         load(root, split="~nobody-of-this-name/list.txt")
     (tmp_path / "list.txt").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(SceneError, match="cannot be read"):

@@ -39,6 +39,8 @@ def split_views(views: Sequence[T], rule: str) -> tuple[list[T], list[T]]:
         return views, list(views)
     match = RULE.fullmatch(rule)
     if match is None:
+        if "/" in rule or rule.lower().endswith((".txt", ".json")):
+            raise SceneError(f"split: {rule}: there is no such file of names")
         raise SceneError(f"unknown split '{rule}': use {RULES}")
     n = int(match[2])
     if match[1] == "every":
