@@ -120,7 +120,7 @@ def test_what_is_no_file_is_an_unknown_rule_and_no_text_is_refused(colmap_folder
     root = colmap_folder.write()
     with pytest.raises(SceneError, match=r"split: held_out\.txt: there is no such file of names"):
         load(root, split="held_out.txt")
-    with pytest.raises(SceneError, match="split: ~nobody-of-this-name/list.*there is no such file"):
+    with pytest.raises(SceneError, match=r"split: ~nobody-of-this-name/list.*there is no such file"):
         load(root, split="~nobody-of-this-name/list.txt")
     (tmp_path / "list.txt").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(SceneError, match="cannot be read"):
