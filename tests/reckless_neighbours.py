@@ -17,7 +17,7 @@ IMPORTS = {
     "sw-filters": ("import warnings\nwarnings.simplefilter('error')\n", "changes the filters of all warnings"),
     "sw-seeds": ("import random\nrandom.seed(0)\n", "changes the random numbers of Python"),
     "sw-recursion": ("import sys\nsys.setrecursionlimit(200)\n", "changes the limit of recursion"),
-    "sw-ctrl-c": ("import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)\n", "changes who answers SIGINT"),
+    "sw-ctrl-c": ("import signal\nsignal.signal(signal.SIGINT, lambda *_: None)\n", "changes who answers SIGINT"),
     "sw-silences": ("import logging\nlogging.disable(logging.CRITICAL)\n", "changes how much is logged"),
     "sw-handlers": ("import logging\nlogging.root.handlers.clear()\n", "changes who writes what is logged"),
     "sw-thread": (
