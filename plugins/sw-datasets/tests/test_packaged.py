@@ -118,7 +118,7 @@ def data(tmp_path: Path, sdist: Path, site: Site, monkeypatch: pytest.MonkeyPatc
 
 
 class _Found:
-    """What a command asks of the registry of downloads."""
+    """Registry of downloads, as far as a command uses it."""
 
     def __init__(self, registry: Registry) -> None:
         self.entries = dict(registry._entries)

@@ -25,7 +25,7 @@ BY_DATASET: Mapping[str, Mapping[str, Any]] = {
     },
     "blender": RANDOM_START,
 }
-"""What preset `paper` sets by data set."""
+"""Values of preset `paper` by data set."""
 
 PRESETS: Mapping[str, Mapping[str, Any]] = {
     # The authors' settings for Mip-NeRF 360.

@@ -137,7 +137,7 @@ WAYS: tuple[tuple[str, Callable[[str], str]], ...] = (
     ("differ from those of the files in upper and lower case", lambda name: name_key(name).casefold()),
     ("differ from those of the files in upper and lower case", lambda name: name_key(_stem(name)).casefold()),
 )
-"""What is to be told of names that are found so -> by what they are compared, the nearest first."""
+"""Warning about names found this way -> form by which names are compared, the nearest form first."""
 
 
 class _Files:

@@ -73,7 +73,7 @@ def load_blender(path: Path, rules: Rules, options: SceneOptions) -> Scene:
 
 
 def _start_points(path: Path, train: Frames, options: SceneOptions, warnings: list[str]) -> PointCloud:
-    """Those that the training file names, those beside it, or random ones in the cube; `warnings` gets what is told."""
+    """Read the points that the training file names, or those beside it, or draw random ones; extends `warnings`."""
     cloud = train.cloud or cloud_beside(path)
     if cloud is not None:
         points = read_cloud(cloud)

@@ -20,7 +20,7 @@ NEEDED = {
     "encode": f"def encode(self, model, writer): writer.add_array(name, array) for all that decode needs; {FILE}",
     "decode": f"def decode(self, reader): a model from reader.array(name, ...) alone; {FILE}",
 }
-"""What a method must have -> what to write."""
+"""Required attribute of a method -> code to write for it."""
 START = (
     "def create_model(self, scene, generator): return gaussians_from_points(start_points(scene, self.name)), both of "
     "sw_gaussians.start; or subclass GaussianMethod, which does so; or starts_from = '3dgs' in the stage"
