@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sw_codecs.context.channel_ar import ChannelAr
+from sw_cat_3dgs.channel_ar import ChannelAr
 
 
 def trained_like(made):
@@ -64,22 +64,3 @@ def test_slices_must_be_sizes():
     for slices in ((), (3, 0)):
         with pytest.raises(ValueError, match="slices"):
             ChannelAr(slices)
-
-
-def test_slices_in_one_node_have_the_gradients_of_their_networks():
-    generator = torch.Generator().manual_seed(0)
-    made = ChannelAr((2, 3, 4), hidden=6, generator=generator).double()
-    with torch.no_grad():
-        for parameter in made.parameters():
-            parameter.copy_(torch.randn(parameter.shape, generator=generator))
-    values, mean, scale = (torch.randn(7, 9, generator=generator).double().requires_grad_() for _ in range(3))
-    shifts = [made.networks[f"slice{i}"](values[:, :end]).chunk(2, dim=1) for i, end in ((1, 2), (2, 5))]
-    expected = [
-        each + torch.cat([torch.zeros(7, 2), *(s[i] for s in shifts)], 1) for i, each in enumerate((mean, scale))
-    ]
-    leaves, weights = [values, mean, scale, *made.parameters()], torch.randn(2, 7, 9, generator=generator)
-    pairs = []
-    for found in (made(values, mean, scale), expected):
-        pairs.append([*found, *torch.autograd.grad((torch.stack(list(found)) * weights).sum(), leaves)])
-    for a, b in zip(*pairs, strict=True):
-        torch.testing.assert_close(a, b)

@@ -6,7 +6,7 @@ from sw_anchors.shape import GROUPS
 
 from sw_cat_3dgs.context import CatContext
 from sw_cat_3dgs.predictors import PREDICTORS
-from sw_codecs.context.triplane import UNIT
+from sw_cat_3dgs.triplane import UNIT
 
 
 @pytest.mark.parametrize("mode", ["exact", "float"])

@@ -11,11 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from splatwizard_core.errors import BitstreamError
-from sw_codecs.context import spatial_ar
-from sw_codecs.context.plane_fields import NEIGHBORS, Field
-from sw_codecs.context.spatial_ar import SpatialAr
+from sw_cat_3dgs.plane_fields import NEIGHBORS, Field
+from sw_cat_3dgs.spatial_ar import SpatialAr
 from sw_codecs.entropy.exact_tables import exact_tables
 from sw_codecs.exact_native import EXACT
+from sw_codecs.testing import check_damage
 
 
 def network(seed=0, scale=1.0):
@@ -79,7 +79,7 @@ def test_any_values_come_back(channels, height, width, seed, spread):
 MEMORY = """
 import sys, torch
 from pathlib import Path
-from sw_codecs.context.spatial_ar import SpatialAr
+from sw_cat_3dgs.spatial_ar import SpatialAr
 
 def kilobytes(name):
     return int(Path("/proc/self/status").read_text().split(name)[1].split()[0])
@@ -146,10 +146,10 @@ def test_the_estimate_is_what_is_coded():
     assert abs(size / floats - 1) < 0.02
 
 
-def test_damage_is_refused(assert_survives_damage):
+def test_damage_is_refused():
     networks, planes = exact_networks(1), [drawn(1, 2, 4, 5, spread=40.0)]
     data = SpatialAr.encode(planes, networks)
-    assert_survives_damage(data, lambda d: SpatialAr.decode(d, [(2, 4, 5)], networks)[0], planes[0], masks=(0x01, 0x80))
+    check_damage(data, lambda d: SpatialAr.decode(d, [(2, 4, 5)], networks)[0], planes[0], masks=(0x01, 0x80))
     with pytest.raises(BitstreamError):
         SpatialAr.decode(data, [(2, 4, 5)], [SpatialAr.exact(network(7, scale=5).state())])
 
@@ -187,33 +187,3 @@ def test_gradients_pull_a_scale_back_into_the_range_of_the_coder():
         made.layers[-1].bias.copy_(torch.tensor([0.0, 20.0]))  # scale e^-10, values 1: too narrow by far
     made.bits(torch.ones(1, 3, 3)).sum().backward()
     assert made.layers[-1].bias.grad[1] > 0
-
-
-@pytest.mark.parametrize("at_once", [1, 2 * 3 * 72, 1 << 20])
-@pytest.mark.parametrize("learn", [True, False])
-def test_all_planes_in_one_node_cost_what_they_cost_one_by_one(learn, at_once, monkeypatch):
-    monkeypatch.setattr(spatial_ar, "VALUES_AT_ONCE", at_once)  # one, two and all channels
-    g = torch.Generator().manual_seed(0)
-    networks = [SpatialAr(g) for _ in range(3)]
-    with torch.no_grad():
-        for network in networks:
-            for parameter in network.parameters():
-                parameter.add_(torch.randn(parameter.shape, generator=g) * 0.2)
-            network.layers[-1].weight[1] *= 20  # some scales beyond the coder's
-    planes = [(torch.randn(3, 3, *size, generator=g) * 4).requires_grad_(learn) for size in ((1, 1), (5, 7), (9, 4))]
-    leaves = [*(planes if learn else []), *(p for network in networks for p in network.parameters())]
-    found = SpatialAr.joint_bits(networks, planes)
-    expected = sum(a.bits(each).sum() for plane in planes for a, each in zip(networks, plane, strict=True))
-    torch.testing.assert_close(found, expected, rtol=1e-5, atol=0)
-    for a, b in zip(*(torch.autograd.grad(3 * each, leaves) for each in (found, expected)), strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4 * float(b.abs().max()))
-        assert a.data_ptr() % 16 == 0
-
-
-def test_a_graph_holds_no_layer_of_the_planes():
-    """Only derivatives by planes and parameters: layers of 30 values an anchor were gigabytes."""
-    networks, planes = [SpatialAr() for _ in range(3)], [torch.zeros(3, 4, 30, 30, requires_grad=True)]
-    kept = []
-    with torch.autograd.graph.saved_tensors_hooks(lambda t: kept.append(t.nbytes) or t, lambda t: t):
-        SpatialAr.joint_bits(networks, planes)
-    assert sum(kept) <= planes[0].nbytes + 3 * 4 * 1100

@@ -6,9 +6,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from splatwizard_core.errors import BitstreamError
-from sw_codecs.context.outliers import inliers, local_outlier_factor
-from sw_codecs.context.principal_frame import UNIT, PrincipalFrame, contract
-from sw_codecs.context.triplane import GAIN, PAIRS, Triplane
+from sw_cat_3dgs.outliers import inliers, local_outlier_factor
+from sw_cat_3dgs.principal_frame import UNIT, PrincipalFrame, contract
+from sw_cat_3dgs.triplane import Triplane
 
 
 def cloud(n=2000, seed=0):
@@ -169,45 +169,3 @@ def test_places_and_features_are_the_same_integers_on_cuda():
     integers = made.integers()
     assert torch.equal(made.exact([i.cuda() for i in integers], places.cuda()).cpu(), made.exact(integers, places))
     assert (made.cuda()(places.cuda()).cpu() - made.cpu()(places)).abs().max() < 1e-4
-
-
-@pytest.mark.parametrize("rounded", [True, False])
-def test_one_node_samples_as_grid_sample_does(rounded):
-    planes = Triplane(4, 3, (1, 2, 3), generator=torch.Generator().manual_seed(0))
-    places = torch.randint(0, UNIT + 1, (30, 3), generator=torch.Generator().manual_seed(1))
-    weights = torch.randn(30, planes.width, generator=torch.Generator().manual_seed(2))
-    with torch.no_grad():
-        for plane in planes.planes:
-            plane *= 100
-
-    def written_out():
-        at = places * (2.0 / UNIT) - 1
-        sites = torch.stack([at[:, pair] for pair in PAIRS])[:, None]
-        total, found = 0, []
-        for plane in planes.planes:
-            if rounded:
-                plane = plane + (torch.round(plane * GAIN) / GAIN - plane).detach()
-            total = total + torch.nn.functional.grid_sample(plane, sites, padding_mode="border", align_corners=True)
-            found.append(total[:, :, 0])
-        return torch.cat(found).flatten(0, 1).T
-
-    results = planes(places, rounded=rounded), written_out()
-    torch.testing.assert_close(*results, atol=1e-6, rtol=1e-5)
-    gradients = [torch.autograd.grad((each * weights).sum(), list(planes.planes)) for each in results]
-    for a, b in zip(*gradients, strict=True):
-        torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-5)
-
-
-@pytest.mark.parametrize("resolution", [1, 2, 5])
-def test_sites_of_some_places_are_rows_of_all(resolution):
-    made = triplane(resolution)
-    places = torch.randint(0, UNIT + 1, (20, 3), generator=torch.Generator().manual_seed(1))
-    places = torch.cat([places, torch.tensor([[0, 0, 0], [UNIT] * 3, [UNIT, 0, UNIT - 1]])])
-    sites, rows = made.sites(places), torch.tensor([22, 3, 20, 21])
-    assert torch.equal(made.at_sites(sites.rows(rows)), made(places[rows]))
-    # Four places of one plane each, whose weights sum to one: the border needs no others.
-    for i, plane in enumerate(made.planes):
-        cells, size = sites.cells[:, i], plane.shape[-1] ** 2
-        assert (cells // size == torch.arange(3)[:, None]).all()
-    torch.testing.assert_close(sites.weights.sum(dim=3), torch.ones(23, 2, 3))
-    assert (sites.weights >= 0).all()

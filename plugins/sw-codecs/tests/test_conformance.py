@@ -90,9 +90,7 @@ CONTEXT_INPUTS = {
         load.from_module(torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.ReLU(), torch.nn.Linear(4, 2))),
         torch.arange(30).reshape(10, 3),
     ),
-    "triplane": lambda load: (load(8, multiples=(1, 2)), torch.rand(10, 3)),
     "spatial-ar": lambda load: (load(), torch.zeros(2, 5, 6)),
-    "channel-ar": lambda load: (load((2, 2)), torch.randn(10, 4), torch.randn(10, 4), torch.rand(10, 4)),
     "channel-mixture": lambda load: (load((2, 2), context=3), torch.randn(10, 4), torch.randn(10, 3)),
     "hash-grid": lambda load: (load((6, 10), (10,), features=2, log2_space=8, log2_planes=8), torch.rand(10, 3)),
 }

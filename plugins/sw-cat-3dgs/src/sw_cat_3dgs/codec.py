@@ -32,9 +32,9 @@ from splatwizard_core.api import BitstreamError
 from sw_cat_3dgs.context import PLANES, CatContext, ContextShape
 from sw_cat_3dgs.model import CatAnchors
 from sw_cat_3dgs.predictors import PREDICTORS, Predictor
+from sw_cat_3dgs.spatial_ar import SpatialAr
 from sw_cat_3dgs.stage import base_resolution
-from sw_codecs.context.spatial_ar import SpatialAr
-from sw_codecs.context.triplane import GAIN
+from sw_cat_3dgs.triplane import GAIN
 from sw_codecs.entropy.conditional import RowContext
 
 if TYPE_CHECKING:

@@ -20,11 +20,11 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.api import BitstreamError
+from sw_cat_3dgs.plane_fields import Field, PlaneModel, lattice_of, predicted
+from sw_cat_3dgs.stream_lanes import LaneReader, LaneWriter
 from sw_codecs.bits import checksum
 from sw_codecs.bits.packing import ByteReader, write_varint
-from sw_codecs.context.plane_fields import Field, PlaneModel, lattice_of, predicted
 from sw_codecs.entropy import exact_streams
-from sw_codecs.entropy.stream_lanes import LaneReader, LaneWriter
 from sw_codecs.exact_native import EXACT
 
 SMALLEST_STREAM = 16_384

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.api import BitstreamError
-from sw_codecs.context.outliers import inliers
+from sw_cat_3dgs.outliers import inliers
 
 UNIT = 1 << 20
 """Places are integers 0 .. UNIT from one side of the box to the other."""

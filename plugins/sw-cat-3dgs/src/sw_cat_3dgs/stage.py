@@ -15,8 +15,8 @@ from sw_anchors.stage import CodedAnchorStage
 
 from splatwizard_core.api import CameraIterator, LossPack, Rasterizer, SplatOptimizer, TaskLog
 from sw_cat_3dgs.config import FULL_RUN, CatConfig
+from sw_cat_3dgs.fast.plane_graphs import FixedPlaneBits
 from sw_cat_3dgs.model import CatAnchors, Trained
-from sw_cat_3dgs.plane_bits import FixedPlaneBits
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from splatwizard_core.api import BitstreamError
-from sw_codecs.context import plane_streams
-from sw_codecs.context.plane_fields import Field, PlaneModel, lattice_of, predicted
+from sw_cat_3dgs import plane_streams
+from sw_cat_3dgs.plane_fields import Field, PlaneModel, lattice_of, predicted
 from sw_codecs.entropy.exact_streams import table_bits as bits_of
 from sw_codecs.entropy.exact_version_1 import ExactReader
 

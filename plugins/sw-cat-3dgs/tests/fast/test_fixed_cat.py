@@ -7,7 +7,7 @@ import pytest
 import torch
 from sw_anchors.testing import check_fixed_decoder
 
-from sw_cat_3dgs.plane_bits import FixedPlaneBits
+from sw_cat_3dgs.fast.plane_graphs import FixedPlaneBits
 
 
 @pytest.fixture
@@ -87,7 +87,7 @@ def test_a_gpu_that_refuses_graphs_of_the_planes_is_named_once(kind, model, monk
     def refuse(*_):
         raise kind("operation not permitted\nand more")
 
-    monkeypatch.setattr("sw_cat_3dgs.plane_bits.CapturedStep", refuse)
+    monkeypatch.setattr("sw_cat_3dgs.fast.plane_graphs.CapturedStep", refuse)
     monkeypatch.setattr(torch.cuda, "device", lambda _: nullcontext())
     fixed = FixedPlaneBits()
     assert all(plane_bits(model, fixed, 1.0)[0] > 0 for _ in range(2))

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from splatwizard_native import seeded
-from sw_codecs.context import plane_kernels, spatial_ar, triplane
-from sw_codecs.context.plane_kernels import fit_kernels
-from sw_codecs.context.spatial_ar import SpatialAr
-from sw_codecs.context.triplane import PlaneSites, Triplane
+from sw_cat_3dgs.fast import plane_bits, plane_kernels, plane_sites
+from sw_cat_3dgs.fast.plane_kernels import fit_kernels
+from sw_cat_3dgs.spatial_ar import SpatialAr
+from sw_cat_3dgs.triplane import Triplane
 from sw_codecs.native import CODECS
 
 ON_CUDA = CODECS.available(cuda=True)
@@ -47,11 +47,11 @@ def test_there_are_none_for_planes_of_more_cells_than_a_grid_has_rows_for(monkey
 @pytest.mark.parametrize(("capability", "taken"), [((7, 5), False), ((8, 0), True), ((12, 0), True)])
 def test_bits_of_planes_are_taken_by_the_kernel_where_there_are_tensor_cores_for_it(capability, taken, monkeypatch):
     networks, plane = [SpatialAr(generator())], torch.ones(1, 2, 3, 4)
-    expected = SpatialAr.joint_bits(networks, [plane])
-    monkeypatch.setattr(spatial_ar, "fit_kernels", lambda _: True)
+    expected = plane_bits.plane_bits(networks, [plane])
+    monkeypatch.setattr(plane_kernels, "fit_kernels", lambda _: True)
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda _: capability)
-    monkeypatch.setattr(spatial_ar, "plane_bits", lambda *_, planes_learn: (torch.full((1, 1060), -1.0), []))
-    torch.testing.assert_close(SpatialAr.joint_bits(networks, [plane]), torch.tensor(-1.0) if taken else expected)
+    monkeypatch.setattr(plane_kernels, "plane_bits", lambda *_, planes_learn: (torch.full((1, 1060), -1.0), []))
+    torch.testing.assert_close(plane_bits.plane_bits(networks, [plane]), torch.tensor(-1.0) if taken else expected)
 
 
 @pytest.mark.cuda
@@ -81,8 +81,8 @@ def test_bits_of_planes_are_those_of_torch(orientations, channels, sizes, spread
     found = []
     for kernel in (True, False):
         if not kernel:
-            monkeypatch.setattr(spatial_ar, "fit_kernels", lambda _: False)
-        bits = SpatialAr.joint_bits(list(networks), planes)
+            monkeypatch.setattr(plane_kernels, "fit_kernels", lambda _: False)
+        bits = plane_bits.plane_bits(list(networks), planes)
         found.append((bits.detach(), *torch.autograd.grad(2 * bits, leaves)))
     close(*found)
     assert all(each.data_ptr() % 16 == 0 for each in found[0][1:] if each.numel())  # as the optimizer's kernel asks
@@ -101,9 +101,7 @@ def test_bits_of_planes_are_those_of_torch(orientations, channels, sizes, spread
     ],
 )
 @pytest.mark.parametrize("rounded", [True, False])
-def test_a_triplane_and_its_gradients_are_those_of_torch(
-    count, resolution, channels, multiples, repeats, rounded, monkeypatch
-):
+def test_a_triplane_and_its_gradients_are_those_of_torch(count, resolution, channels, multiples, repeats, rounded):
     draw = generator(1)
     planes = Triplane(resolution, channels, multiples, generator=draw)
     with torch.no_grad():
@@ -112,13 +110,11 @@ def test_a_triplane_and_its_gradients_are_those_of_torch(
     places = torch.randint(0, (1 << 20) + 1, (count, 3), generator=draw).repeat_interleave(repeats, dim=0)
     slopes = torch.randn(len(places), planes.width, generator=draw)
     slopes[count // 3 : count // 3 + 2] = 0  # rows beyond the count of a step have none
-    planes, slopes = planes.to("cuda"), slopes.to("cuda")
-    sites = PlaneSites(*(part.to("cuda") for part in planes.to("cuda").sites(places.to("cuda"))))
+    planes, slopes, places = planes.to("cuda"), slopes.to("cuda"), places.to("cuda")
+    assert plane_sites.fits(list(planes.planes))
     found = []
-    for kernel in (True, False):
-        if not kernel:
-            monkeypatch.setattr(triplane, "fit_kernels", lambda _: False)
-        features = planes.at_sites(sites, rounded=rounded)
+    for look_up in (plane_sites.look_up, Triplane.forward):
+        features = look_up(planes, places, rounded=rounded)
         found.append((features.detach(), *torch.autograd.grad((features * slopes).sum(), list(planes.planes))))
     close(*found) if count else None
     assert found[0][0].shape == found[1][0].shape
@@ -135,12 +131,12 @@ def test_where_it_is_asked_for_sums_are_the_same_each_time_and_those_of_the_fast
     places = torch.randint(0, 1 << 16, (20_000, 3), generator=draw)
     slopes = torch.randn(len(places), made.width, generator=draw).to("cuda")
     made = made.to("cuda")
-    sites = made.sites(places.to("cuda"))
+    sites = plane_sites.sites_of(list(made.planes), places.to("cuda"))
 
     def slopes_of():
-        bits = SpatialAr.joint_bits(networks, planes)
+        bits = plane_bits.plane_bits(networks, planes)
         learning = [*planes, *(p for network in networks for p in network.parameters())]
-        features = (made.at_sites(sites) * slopes).sum()
+        features = (plane_sites.sample(list(made.planes), sites, rounded=True) * slopes).sum()
         by_planes = torch.autograd.grad(features, list(made.planes))
         return [bits.detach(), *torch.autograd.grad(bits, learning), *by_planes]
 
@@ -157,7 +153,7 @@ def test_where_it_is_asked_for_sums_are_the_same_each_time_and_those_of_the_fast
 @needs_gpu
 def test_planes_without_values_have_no_bits():
     networks, plane = [SpatialAr().to("cuda") for _ in range(3)], torch.zeros(3, 4, 0, 0, device="cuda")
-    bits = SpatialAr.joint_bits(networks, [plane])
+    bits = plane_bits.plane_bits(networks, [plane])
     (slope,) = torch.autograd.grad(bits, networks[0].layers[0].weight)
     assert float(bits) == 0
     assert not bool(slope.any())

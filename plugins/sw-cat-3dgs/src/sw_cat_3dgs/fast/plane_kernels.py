@@ -1,4 +1,4 @@
-"""Kernels of CUDA for learned planes in training: their bits under spatial models, and lookup at kept sites."""
+"""Kernels of CUDA for planes in training: their bits under spatial models, and features at kept sites."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ def plane_bits(planes: Sequence[Tensor], parameters: Tensor, *, planes_learn: bo
     return found
 
 
-def look_up(cells: Tensor, weights: Tensor, planes: Sequence[Tensor], gain: float) -> Tensor:
-    """Features [n, sizes * 3 C] of planes [3,C,H,W] at sites, as of `triplane.PlaneSites`; no gradient.
+def sampled(cells: Tensor, weights: Tensor, planes: Sequence[Tensor], gain: float) -> Tensor:
+    """Features [n, sizes * 3 C] of planes [3,C,H,W] at sites, as of `plane_sites.PlaneSites`; no gradient.
 
     gain    planes are rounded to multiples of 1 / gain; 0: they are not
     """
@@ -61,7 +61,7 @@ def look_up(cells: Tensor, weights: Tensor, planes: Sequence[Tensor], gain: floa
     return found
 
 
-def look_up_backward(cells: Tensor, weights: Tensor, slopes: Tensor, planes: Sequence[Tensor]) -> list[Tensor]:
+def sampled_backward(cells: Tensor, weights: Tensor, slopes: Tensor, planes: Sequence[Tensor]) -> list[Tensor]:
     """Derivatives by the planes, from those by the features [n, sizes * 3 C]. Fastest if neighbours follow each other.
 
     planes      for their shapes alone
