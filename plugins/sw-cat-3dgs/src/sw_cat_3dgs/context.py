@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from sw_anchors.anchors import linear_layers
+from sw_anchors.fast.predicted_steps import predicted_steps
 from sw_anchors.forecasts import AnchorContext, AnchorForecast, Triple, triple
 from sw_anchors.lattice import low_and_step
-from sw_anchors.predicted_steps import predicted_steps
 from sw_anchors.shape import AnchorShape
 from torch import Tensor, nn
 
