@@ -309,12 +309,12 @@ def timed(method: str, args: argparse.Namespace, gpu: str) -> dict[str, Any]:
 
 def operations(device: str) -> dict[str, Callable[[], list[Tensor]]]:
     """Name -> () -> tensors whose bits must be equal each time; sizes of a real step."""
-    from sw_anchors.fixed_step import sample_of
-    from sw_anchors.fused_ops import add_rows
+    from sw_anchors.fast.fixed_step import sample_of
+    from sw_anchors.fast.fused_ops import add_rows
+    from sw_anchors.fast.pool_rows import bernoulli_rows
+    from sw_anchors.fast.seen_rows import ExpectedRows
+    from sw_anchors.fast.view_networks import network_outputs
     from sw_anchors.neural_gaussians import visible_gaussians
-    from sw_anchors.pool_rows import bernoulli_rows
-    from sw_anchors.seen_rows import ExpectedRows
-    from sw_anchors.view_networks import network_outputs
     from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_scene
 
     from splatwizard_core.api import RasterOptions, photometric_loss
@@ -322,9 +322,10 @@ def operations(device: str) -> dict[str, Callable[[], list[Tensor]]]:
     from sw_cat_3dgs.spatial_ar import SpatialAr
     from sw_cat_3dgs.triplane import Triplane
     from sw_codecs.codebooks.kmeans import kmeans
-    from sw_codecs.context.hash_grid import HashGrid, MixedHashGrid
+    from sw_codecs.context.hash_grid import HashGrid
     from sw_codecs.context.two_layers import two_layers
     from sw_codecs.quantizers.residual_quantizer import ResidualVectorQuantizer
+    from sw_hac.mixed_grid import MixedHashGrid
     from sw_rasterizers.standard import StandardRasterizer
     from sw_rasterizers.surfel import SurfelRasterizer
 

@@ -47,7 +47,7 @@ os.environ.setdefault("TEARDOWN_CUPTI", "0")
 import torch
 from scene_names import FORMS, split_scene
 from step_parts import SECTION, kernel_times, longest_kernels, report
-from sw_anchors import fused_ops, mixture_bits, view_networks
+from sw_anchors.fast import fused_ops, mixture_bits, view_networks
 from torch.profiler import ProfilerActivity, profile, record_function
 
 from splatwizard_core.gaussians.inputs import rgb_to_dc

@@ -1,4 +1,4 @@
-"""Who may import whom: knowledge flows downward, through two faces, and no method is imported by anybody."""
+"""Who may import whom: knowledge flows downward, through two faces; only what extends a method imports it."""
 
 from __future__ import annotations
 
@@ -58,6 +58,8 @@ LIBRARIES = {
     "sw_render", "sw_report",
 }  # fmt: skip
 """Packages that others may import when they declare them; of sw_report the file format of published figures alone."""
+EXTENDS = {"sw_hac_plus": "sw_hac"}
+"""Method -> the method that it builds on, and so imports."""
 ABOUT_RUNS = {
     "sw_bench", "sw_datasets", "sw_doctor", "sw_geometry", "sw_kit", "sw_metrics", "sw_render", "sw_report",
     "sw_viewer",
@@ -130,10 +132,10 @@ CLOSURES = {
 """Method -> the most modules and lines of its closure, where not (45, 4,500)."""
 CLOSURE = (45, 4_500)
 NOT_YET = {
-    "sw_cat_3dgs.method": (84, 10_670),
-    "sw_compact3dgs.method": (55, 5_820),
-    "sw_hac.method": (83, 10_160),
-    "sw_hac_plus.method": (88, 11_000),
+    "sw_cat_3dgs.method": (71, 8_850),
+    "sw_compact3dgs.method": (52, 5_390),
+    "sw_hac.method": (64, 7_930),
+    "sw_hac_plus.method": (71, 8_890),
     "sw_trimgs.surfel_method": (46, 5_010),
 }
 """Closures that are larger than that today; they may shrink, and go from here once they fit."""
@@ -159,12 +161,6 @@ FAMILIES = {"sw_hac_plus": "sw_hac"}
 SHELVES = {"sw_rasterizers", "sw_codecs", "sw_gaussians", "sw_anchors", "sw_finetuning", "sw_reference"}
 """Libraries for methods: what stands there serves two families, or can be chosen by name."""
 FOR_ONE = {
-    **dict.fromkeys(
-        (f"sw_anchors.grid_{part}" for part in ("anchors", "params", "predictors", "quick", "sections", "stage")),
-        "moves to sw-hac",
-    ),
-    "sw_anchors.predicted_outputs": "moves to sw-hac-plus",
-    "sw_anchors.voxel_lattice": "moves to sw-hac-plus",
     "sw_gaussians.bake_refining": "trains on pictures that sw-view gives it, with the stage of sw-gaussians",
 }
 """Module of a library that one family alone reaches -> why it is there; at most ten in the end."""
@@ -210,8 +206,8 @@ CIRCLES_OF_TYPES = [
      "splatwizard_core.plugins.manager", "splatwizard_core.plugins.origins", "splatwizard_core.runs.observers"},
     {"splatwizard_native", "splatwizard_native.fused.activations", "splatwizard_native.fused.adam",
      "splatwizard_native.fused.in_backward", "splatwizard_native.fused.native", "splatwizard_native.fused.photometric"},
-    {"sw_anchors.coded_anchors", "sw_anchors.fixed_decoder", "sw_anchors.fixed_step", "sw_anchors.pool_rows"},
-    {"sw_codecs.context.grid_lookup", "sw_codecs.context.grid_nodes", "sw_codecs.context.hash_grid"},
+    {"sw_anchors.coded_anchors", "sw_anchors.fast.fixed_decoder", "sw_anchors.fast.fixed_step",
+     "sw_anchors.fast.pool_rows"},
     {"sw_interchange.frames", "sw_interchange.scene"},
     {"sw_interchange.spz", "sw_interchange.spz_fields"},
 ]  # fmt: skip
@@ -251,7 +247,7 @@ def test_a_package_imports_the_core_through_its_faces(package):
 @pytest.mark.parametrize("package", [*PACKAGES, *STRANGERS], ids=lambda p: p.name)
 def test_a_package_imports_declared_libraries_alone(package):
     others = {m.split(".")[0] for p in files_of(package) for m in imported(p) if m.startswith("sw_")} - {package.name}
-    assert others <= LIBRARIES
+    assert others <= LIBRARIES | {EXTENDS.get(package.name)}
     assert {name.replace("_", "-") for name in others} <= declared_dependencies(package)
 
 

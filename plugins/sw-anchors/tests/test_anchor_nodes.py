@@ -2,11 +2,11 @@
 
 import pytest
 import torch
-from sw_anchors.fixed_step import sample_capacity
-from sw_anchors.fused_ops import anchor_values, mean_product, take_rows, weighted_sum, widen
+from sw_anchors.fast.fixed_step import sample_capacity
+from sw_anchors.fast.fused_ops import anchor_values, mean_product, take_rows, weighted_sum, widen
+from sw_anchors.fast.pool_rows import bernoulli_rows
 from sw_anchors.neural_gaussians import spawn, visible_gaussians
 from sw_anchors.noisy_values import Noise, noisy_values
-from sw_anchors.pool_rows import bernoulli_rows
 
 from splatwizard_native import seeded
 from sw_codecs.context.two_layers import two_layers

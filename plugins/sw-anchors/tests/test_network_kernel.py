@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
-from sw_anchors import view_networks
 from sw_anchors.anchors import two_layers
+from sw_anchors.fast import view_networks
+from sw_anchors.fast.view_networks import fit_kernel, network_outputs, parameters_of
 from sw_anchors.native import ANCHORS
-from sw_anchors.view_networks import fit_kernel, network_outputs, parameters_of
 
 ON_CUDA = ANCHORS.available(cuda=True)
 pytestmark = [pytest.mark.cuda, pytest.mark.skipif(ON_CUDA is not None, reason=str(ON_CUDA))]

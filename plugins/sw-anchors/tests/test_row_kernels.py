@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
-from sw_anchors import fused_ops
-from sw_anchors.fused_ops import add_rows, load_rows, noisy_rows, put_rows, sample_bits, take_rows
+from sw_anchors.fast import fused_ops
+from sw_anchors.fast.fused_ops import add_rows, load_rows, noisy_rows, put_rows, sample_bits, take_rows
 from sw_anchors.native import ANCHORS
 
 ON_CUDA = ANCHORS.available(cuda=True)

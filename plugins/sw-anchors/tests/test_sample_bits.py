@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from sw_anchors.fused_ops import sample_bits
+from sw_anchors.fast.fused_ops import sample_bits
 from sw_anchors.noisy_values import draws
 
 

@@ -11,11 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from splatwizard_core.errors import BitstreamError
+from splatwizard_core.plugins import load_plugins
 from sw_cat_3dgs.plane_fields import NEIGHBORS, Field
 from sw_cat_3dgs.spatial_ar import SpatialAr
 from sw_codecs.entropy.exact_tables import exact_tables
 from sw_codecs.exact_native import EXACT
-from sw_codecs.testing import check_damage
+from sw_codecs.testing import check_context_model, check_damage
 
 
 def network(seed=0, scale=1.0):
@@ -187,3 +188,8 @@ def test_gradients_pull_a_scale_back_into_the_range_of_the_coder():
         made.layers[-1].bias.copy_(torch.tensor([0.0, 20.0]))  # scale e^-10, values 1: too narrow by far
     made.bits(torch.ones(1, 3, 3)).sum().backward()
     assert made.layers[-1].bias.grad[1] > 0
+
+
+def test_it_is_the_context_model_that_files_name():
+    assert load_plugins().context_models.load("spatial-ar") is SpatialAr
+    check_context_model(SpatialAr(), torch.zeros(2, 5, 6))

@@ -7,7 +7,6 @@ from sw_anchors.attribute_sections import AttributeEncoder
 from sw_anchors.coded_anchors import ENTROPY
 from sw_anchors.sections import round_networks
 from sw_anchors.shape import GROUPS
-from sw_anchors.voxel_lattice import kept_voxels
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.plugins import load_plugins
@@ -18,6 +17,7 @@ from sw_hac_plus import codec
 from sw_hac_plus.config import HACPlusConfig
 from sw_hac_plus.method import HACPlus
 from sw_hac_plus.model import HACPlusAnchors
+from sw_hac_plus.voxel_lattice import kept_voxels
 
 PLUGINS = load_plugins()
 SMALL = {

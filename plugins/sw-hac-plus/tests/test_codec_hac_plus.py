@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from sw_anchors.sections import BOUNDS_BYTES
 from sw_anchors.shape import GROUPS
 from sw_anchors.testing import check_without_kernels
-from sw_anchors.voxel_lattice import kept_voxels
 from sw_kit.forged_files import forged
 from sw_reference.rasterizer import ReferenceRasterizer
 from sw_reference.testing.raster_scenes import front_camera
@@ -22,6 +21,7 @@ from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene
 from sw_hac_plus import codec, predictors
 from sw_hac_plus.method import HACPlus
+from sw_hac_plus.voxel_lattice import kept_voxels
 
 RASTERIZER = ReferenceRasterizer()
 FEATURES = ["features.1", "features.2", "features.3"]

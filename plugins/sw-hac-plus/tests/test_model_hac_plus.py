@@ -3,11 +3,9 @@
 import pytest
 import torch
 from hac_plus_models import decoded, encoded, generator, make, published
-from sw_anchors.grid_anchors import GridAnchors
 from sw_anchors.growth import adjust_anchors
 from sw_anchors.noisy_values import draws
 from sw_anchors.testing import check_nothing_is_waited_for
-from sw_anchors.voxel_lattice import voxel_integers, within_reach
 from sw_reference.rasterizer import ReferenceRasterizer
 from sw_reference.testing.raster_scenes import front_camera
 
@@ -15,8 +13,10 @@ from splatwizard_core.errors import ConfigError
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
 from sw_codecs.entropy.rates import gaussian_mass
+from sw_hac.model import HACAnchors
 from sw_hac_plus.config import HACPlusConfig
 from sw_hac_plus.stage import HACPlusStage
+from sw_hac_plus.voxel_lattice import voxel_integers, within_reach
 
 RASTERIZER = ReferenceRasterizer()
 
@@ -230,12 +230,12 @@ def test_without_channels_and_masks_of_anchors_the_rate_is_that_of_hac(units):
     gradients = {name: p.grad.clone() for name, p in model.named_parameters() if p.grad is not None}
     model.zero_grad()
 
-    forecast = GridAnchors.forecast_at(model, model.context_rows())
+    forecast = HACAnchors.forecast_at(model, model.context_rows())
     values = torch.cat([model.features, model.log_scales.exp(), model.offsets.flatten(1)], dim=1)
     values = values + noise_of_rate(model) * model.widened(forecast.steps)
     masks = model.masks()
     kept = masks.detach().amax(dim=1)
-    expected = GridAnchors.rate_of(model, torch.arange(40), values, forecast, masks, kept, kept.mean())
+    expected = HACAnchors.rate_of(model, torch.arange(40), values, forecast, masks, kept, kept.mean())
     torch.testing.assert_close(found.bits, expected.bits, rtol=1e-6, atol=0)
     torch.testing.assert_close(found.by_group, expected.by_group, rtol=1e-6, atol=0)
     assert torch.equal(found.own_bits, expected.own_bits)

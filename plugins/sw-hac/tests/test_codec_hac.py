@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from sw_anchors.attribute_sections import ExactNetwork
 from sw_anchors.decoded_anchors import DecodedAnchors
 from sw_anchors.float_mode import this_machine
-from sw_anchors.grid_predictors import PREDICTORS
 from sw_anchors.sections import morton_order
 from sw_anchors.shape import GROUPS
 from sw_anchors.testing import check_without_kernels
@@ -32,6 +31,7 @@ from sw_codecs.entropy.conditional import RowContext
 from sw_codecs.entropy.lattice import RowLattice, lattice
 from sw_hac import codec
 from sw_hac.method import HAC
+from sw_hac.predictors import PREDICTORS
 
 RASTERIZER = ReferenceRasterizer()
 SECTIONS = ["anchors", "masks", "grids", "networks", "features", "scalings", "offsets"]
@@ -410,7 +410,7 @@ def test_a_wide_grid_is_looked_up_a_few_anchors_at_a_time(mode, monkeypatch):
     limit = 20 * grid.corners
     for where, name in (
         ("sw_anchors.attribute_sections", "EXACT_NUMBERS"),
-        ("sw_anchors.grid_predictors", "FLOAT_NUMBERS"),
+        ("sw_hac.predictors", "FLOAT_NUMBERS"),
     ):
         monkeypatch.setattr(f"{where}.{name}", limit)
     found = PREDICTORS[mode](grid, model.mlp_grid, model.shape, model.base_steps)(model.codes())

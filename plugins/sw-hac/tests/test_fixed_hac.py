@@ -7,12 +7,13 @@ import pytest
 import torch
 from hac_models import make
 from sw_anchors.coded_anchors import ENTROPY, FULL, QUANTIZED
-from sw_anchors.fixed_decoder import FixedDecoder
-from sw_anchors.fixed_step import FixedRows, sample_capacity, sample_of
-from sw_anchors.grid_anchors import GridAnchors
-from sw_anchors.seen_rows import ExpectedRows, SeenRows, capacity_of
+from sw_anchors.fast.fixed_decoder import FixedDecoder
+from sw_anchors.fast.fixed_step import FixedRows, sample_capacity, sample_of
+from sw_anchors.fast.seen_rows import ExpectedRows, SeenRows, capacity_of
 from sw_anchors.testing import check_fixed_decoder
 from sw_reference.testing.raster_scenes import front_camera
+
+from sw_hac.model import HACAnchors
 
 N = 330
 
@@ -29,11 +30,8 @@ def test_fixed_sizes_change_neither_values_nor_gradients():
     check_fixed_decoder(trained, front_camera(), counts=(0, 1, 120, 255, N))
 
 
-@pytest.mark.parametrize("kept", [True, False])
-def test_without_a_kernel_for_the_grid_it_is_the_same(kept, monkeypatch):
-    monkeypatch.setattr("sw_codecs.context.hash_grid.signs_fit_kernel", lambda *_: False)
-    monkeypatch.setattr("sw_anchors.grid_anchors.PLACES_LIMIT", 1 << 30 if kept else 0)
-    assert len(trained().context_rows()) == (4 if kept else 1)
+def test_without_a_kernel_for_the_grid_it_is_the_same(monkeypatch):
+    monkeypatch.setattr("sw_hac.fast.sign_lookup.fits", lambda *_: False)
     check_fixed_decoder(trained, front_camera(), counts=(90,), phases=(ENTROPY,))
 
 
@@ -150,7 +148,7 @@ def test_a_view_that_comes_again_is_decoded_though_graphs_are_refused_by_then(se
     model.phase, model.fixed = FULL, FixedDecoder(graphs=False)
     model.gaussians(camera, Seen(range(100)))
     model.fixed._drop()
-    monkeypatch.setattr("sw_anchors.fixed_decoder.PlainStep", refuse)
+    monkeypatch.setattr("sw_anchors.fast.fixed_decoder.PlainStep", refuse)
     assert model.fixed.expected(camera, N) == 256
     assert sorted(model.gaussians(camera, Seen(range(seen))).extras["anchors"].rows.tolist()) == list(range(seen))
     assert model.fixed.expected(camera, N) is None
@@ -162,10 +160,10 @@ def test_what_a_subclass_has_of_its_own_is_asked_for_views_that_come_again_too(n
 
     def own(self, *given):
         asked.append(given)
-        return getattr(GridAnchors, name)(self, *given)
+        return getattr(HACAnchors, name)(self, *given)
 
     model, camera = trained().train(), front_camera()
-    model.__class__, model.fixed = type("Own", (GridAnchors,), {name: own}), FixedDecoder(graphs=False)
+    model.__class__, model.fixed = type("Own", (HACAnchors,), {name: own}), FixedDecoder(graphs=False)
     for _ in range(2):
         assert model.gaussians(camera, Seen(range(100))).extras["anchors"].rows.tolist() == list(range(100))
     assert len(asked) == 2
@@ -267,7 +265,7 @@ def test_a_gpu_that_refuses_graphs_is_named_once_and_training_goes_on(kind, monk
     def refuse(*_):
         raise kind("operation not permitted\nand more")
 
-    monkeypatch.setattr("sw_anchors.fixed_decoder.CapturedStep", refuse)
+    monkeypatch.setattr("sw_anchors.fast.fixed_decoder.CapturedStep", refuse)
     monkeypatch.setattr(torch.cuda, "graph_pool_handle", lambda: (0, 0))
     monkeypatch.setattr(torch.cuda, "device", lambda _: nullcontext())
     model = trained().train()

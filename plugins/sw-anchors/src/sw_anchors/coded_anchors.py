@@ -13,13 +13,13 @@ import torch
 from torch import Tensor, nn
 
 from sw_anchors.anchors import AnchorAttributes, AnchorModel
+from sw_anchors.fast.fused_ops import anchor_values, sample_bits, take_rows, widen
+from sw_anchors.fast.mixture_bits import MaskKind, Predicted, fit_mixture_kernel, mixture_bits
+from sw_anchors.fast.pool_rows import bernoulli_rows
+from sw_anchors.fast.seen_rows import ExpectedRows, SeenRows
 from sw_anchors.forecasts import AnchorContext, AnchorForecast, AnchorRate, Triple, triple
-from sw_anchors.fused_ops import anchor_values, sample_bits, take_rows, widen
 from sw_anchors.lattice import Margin, bounds_of, coded_positions, position_codes
-from sw_anchors.mixture_bits import MaskKind, Predicted, fit_mixture_kernel, mixture_bits
 from sw_anchors.noisy_values import Noise, Tables, draws, noisy_values
-from sw_anchors.pool_rows import bernoulli_rows
-from sw_anchors.seen_rows import ExpectedRows, SeenRows
 from sw_codecs.entropy.rates import lower_bound
 from sw_codecs.positions.morton import interleave
 from sw_codecs.quantizers.binary import SteMask
@@ -27,8 +27,8 @@ from sw_codecs.quantizers.rounding import SteRound
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Camera, GaussianInputs, Rasterizer
-    from sw_anchors.fixed_decoder import FixedDecoder
-    from sw_anchors.pool_rows import PoolRows
+    from sw_anchors.fast.fixed_decoder import FixedDecoder
+    from sw_anchors.fast.pool_rows import PoolRows
 
 FULL, QUANTIZED, ENTROPY = "full precision", "quantized training", "entropy training"
 """Phases of training: raw values; noise of fixed steps; noise of predicted steps, with a rate."""
@@ -56,7 +56,7 @@ class CodedAnchors(AnchorModel):
     bounds: Tensor
 
     HAS_FIXED_FORM: ClassVar[bool] = True
-    """Whether `sw_anchors.fixed_step` computes what a training step of this class does."""
+    """Whether `sw_anchors.fast.fixed_step` computes what a training step of this class does."""
 
     SAMPLES_ALL: ClassVar[bool] = False
     """Whether the rate is of a sample of all anchors, not of the visible ones; then there is `pool_rate`."""

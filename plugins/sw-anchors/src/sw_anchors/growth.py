@@ -13,7 +13,7 @@ from torch import Tensor
 
 from splatwizard_core.api import EmptyModel, SplatOptimizer
 from sw_anchors.anchors import AnchorModel, AnchorSelection
-from sw_anchors.fused_ops import add_rows
+from sw_anchors.fast.fused_ops import add_rows
 
 MAX_LOG_BASE_SCALE = 0.05
 """Logarithms of the base scales (columns 3 to 5) above this are lowered to it at every adjustment."""

@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sw_anchors.fused_heads import fits_kernel, spawn_by_kernel
+from sw_anchors.fast.fused_heads import fits_kernel, spawn_by_kernel
+from sw_anchors.fast.view_networks import Networks, network_outputs
 from sw_anchors.native import ANCHORS
-from sw_anchors.view_networks import Networks, network_outputs
 
 GEOMETRY = 7
 """Outputs of the covariance network per Gaussian: 3 scale factors, 4 quaternion components."""

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sw_anchors.fused_ops import anchor_values, take_rows, widen
+from sw_anchors.fast.fused_ops import anchor_values, take_rows, widen
 from sw_anchors.native import ANCHORS
 from sw_codecs.quantizers.rounding import add_noise
 

@@ -23,8 +23,8 @@ from splatwizard_core.api import (
 )
 from sw_anchors.anchors import AnchorModel
 from sw_anchors.coded_anchors import CodedAnchors
-from sw_anchors.fixed_decoder import FixedDecoder
-from sw_anchors.fused_ops import Weighted, mean_product, weighted_sum
+from sw_anchors.fast.fixed_decoder import FixedDecoder
+from sw_anchors.fast.fused_ops import Weighted, mean_product, weighted_sum
 from sw_anchors.growth import accumulate_anchor_statistics, adjust_anchors
 from sw_anchors.params import AnchorParams, CodedAnchorParams
 

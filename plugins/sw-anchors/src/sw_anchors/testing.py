@@ -16,12 +16,12 @@ from torch import Tensor
 from splatwizard_core.api import Camera
 from sw_anchors.coded_anchors import ENTROPY, FULL, QUANTIZED, CodedAnchors
 from sw_anchors.decoded_anchors import DecodedAnchors
-from sw_anchors.fixed_decoder import FixedDecoder
-from sw_anchors.fixed_step import FixedRows
-from sw_anchors.fused_ops import mean_product
+from sw_anchors.fast.fixed_decoder import FixedDecoder
+from sw_anchors.fast.fixed_step import FixedRows
+from sw_anchors.fast.fused_ops import mean_product
+from sw_anchors.fast.pool_rows import PoolRows
+from sw_anchors.fast.seen_rows import capacity_of
 from sw_anchors.growth import accumulate_anchor_statistics
-from sw_anchors.pool_rows import PoolRows
-from sw_anchors.seen_rows import capacity_of
 from sw_codecs.exact_native import EXACT
 
 PHASES = (FULL, QUANTIZED, ENTROPY)

@@ -18,7 +18,8 @@ from sw_anchors.lattice import low_and_step
 from sw_anchors.shape import AnchorShape
 from torch import Tensor, nn
 
-from sw_cat_3dgs import fast, spatial_ar
+from splatwizard_native import fast_enabled
+from sw_cat_3dgs import spatial_ar
 from sw_cat_3dgs.channel_ar import ChannelAr
 from sw_cat_3dgs.fast import plane_bits, plane_sites, slices
 from sw_cat_3dgs.principal_frame import PrincipalFrame
@@ -169,7 +170,7 @@ class CatContext(nn.Module):
 
     def refined(self, means: Sequence[Tensor], scales: Sequence[Tensor], features: Tensor) -> tuple[Triple, Triple]:
         """Refine means and scales of the groups by features [V,F]."""
-        refined = slices.refined if fast.wanted() else ChannelAr.forward
+        refined = slices.refined if fast_enabled() else ChannelAr.forward
         found = [refined(self.slices, features, means[0], scales[0])]
         for name, mean, scale in zip(("scales", "offsets"), means[1:], scales[1:], strict=True):
             found.append(self.slices.refine(name, features, mean, scale) if self.shape.refine else (mean, scale))

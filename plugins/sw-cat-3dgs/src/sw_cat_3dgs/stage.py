@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from sw_anchors.coded_anchors import ENTROPY, QUANTIZED
-from sw_anchors.fused_ops import Weighted
+from sw_anchors.fast.fused_ops import Weighted
 from sw_anchors.phase_switch import PhaseSwitch
 from sw_anchors.stage import CodedAnchorStage
 

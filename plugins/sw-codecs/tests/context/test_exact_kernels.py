@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from sw_codecs.context.hash_grid import HashGrid, MixedHashGrid
+from sw_codecs.context.hash_grid import HashGrid
 from sw_codecs.context.integer_mlp import IntegerMlp
 
 
@@ -79,20 +79,6 @@ def test_a_leaky_network_of_inputs_side_by_side(leak, widths, kernels):
     for narrow in ([0], [1], [0, 1]):
         given = [part.to(torch.int16) if i in narrow else part for i, part in enumerate(small)]
         assert torch.equal(made(*given), made(*small))
-
-
-@pytest.mark.parametrize("features", [1, 4, 6, 16])
-def test_a_mixed_hash_grid(features, kernels):
-    grid = MixedHashGrid(
-        (6, 18, 33, 9), (10, 130), features=features, log2_space=9, log2_planes=8, generator=generator()
-    )
-    codes = torch.randint(-3, 65_539, (500, 3), generator=generator(1))
-    codes[:4] = torch.tensor([[0, 0, 0], [65_535] * 3, [0, 65_535, 1], [65_536, 5, 5]])
-    ours, expected = both(kernels, lambda: grid.integer_features(codes))
-    assert torch.equal(ours, expected)
-    for short in both(kernels, lambda: grid.integer_features(codes, torch.int16)):
-        assert short.dtype == torch.int16
-        assert torch.equal(short.to(torch.int64), expected)
 
 
 def test_a_table_that_changed_is_looked_up_anew(kernels):

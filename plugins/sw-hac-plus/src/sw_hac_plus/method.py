@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from sw_anchors.voxel_lattice import check_reach
-
 from splatwizard_core.api import ConfigError, Method, SceneError
-from sw_codecs.context.channel_mixture import PARTS, ChannelMixture
 from sw_hac_plus import codec
+from sw_hac_plus.channel_mixture import PARTS, ChannelMixture
 from sw_hac_plus.config import HACPlusConfig
 from sw_hac_plus.model import HACPlusAnchors
 from sw_hac_plus.presets import BY_DATASET, PRESETS, RATES
 from sw_hac_plus.stage import HACPlusStage
+from sw_hac_plus.voxel_lattice import check_reach
 
 if TYPE_CHECKING:
     import torch

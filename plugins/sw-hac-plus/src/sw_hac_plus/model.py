@@ -11,24 +11,24 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from sw_anchors.anchors import AnchorAttributes, linear_layers
-from sw_anchors.channel_networks import ChannelNetworks
 from sw_anchors.coded_anchors import MASK_THRESHOLD
+from sw_anchors.fast.fused_ops import anchor_values, noisy_rows, times_ones
+from sw_anchors.fast.mixture_bits import MaskKind, fit_mixture_kernel, mixture_bits
+from sw_anchors.fast.seen_rows import SeenRows
 from sw_anchors.forecasts import AnchorForecast, AnchorRate
-from sw_anchors.fused_ops import anchor_values, noisy_rows, times_ones
-from sw_anchors.grid_anchors import SMALLEST_STEP, GridAnchors
 from sw_anchors.lattice import position_codes
-from sw_anchors.mixture_bits import MaskKind, fit_mixture_kernel, mixture_bits
-from sw_anchors.predicted_outputs import steps_and_outputs
-from sw_anchors.seen_rows import SeenRows
-from sw_anchors.voxel_lattice import voxel_integers, voxel_positions, within_reach
 from torch import Tensor, nn
 
-from sw_codecs.context.channel_mixture import ChannelMixture
 from sw_codecs.entropy import rates
 from sw_codecs.quantizers.rounding import add_noise
+from sw_hac.model import SMALLEST_STEP, HACAnchors
+from sw_hac_plus.channel_mixture import ChannelMixture
+from sw_hac_plus.fast.channel_networks import ChannelNetworks
+from sw_hac_plus.fast.steps_and_outputs import steps_and_outputs
+from sw_hac_plus.voxel_lattice import voxel_integers, voxel_positions, within_reach
 
 if TYPE_CHECKING:
-    from sw_anchors.pool_rows import PoolRows
+    from sw_anchors.fast.pool_rows import PoolRows
 
     from splatwizard_core.api import Camera, GaussianInputs
 
@@ -47,8 +47,8 @@ class PoolForecast(AnchorForecast):
     outputs: Tensor
 
 
-class HACPlusAnchors(GridAnchors):
-    """GridAnchors on a lattice of voxels, with a channel context; the rate of any anchor may switch it off.
+class HACPlusAnchors(HACAnchors):
+    """HACAnchors on a lattice of voxels, with a channel context; the rate of any anchor may switch it off.
 
     channel             second Gaussian of each feature; None: the grid alone predicts, as in HAC
     anchor_gradient     whether the gradient of all bits of an anchor reaches its masks
@@ -62,7 +62,7 @@ class HACPlusAnchors(GridAnchors):
     def __init__(
         self, *tensors: Tensor, channel: ChannelMixture | None, anchor_gradient: bool = True, **kwargs: Any
     ) -> None:
-        """As GridAnchors."""
+        """As HACAnchors."""
         super().__init__(*tensors, further=0 if channel is None else tensors[1].shape[1], **kwargs)
         self.channel = None if channel is None else channel.to(self.features)
         self.anchor_gradient = anchor_gradient

@@ -11,17 +11,17 @@ from dataclasses import dataclass
 import torch
 from sw_anchors.attribute_sections import ExactNetwork
 from sw_anchors.float_mode import Mode, one_thread
-from sw_anchors.grid_anchors import context_of
-from sw_anchors.grid_predictors import BlockPrediction, row_width, short_features
 from sw_anchors.lattice import TOP
 from sw_anchors.row_parts import EXACT_NUMBERS, FLOAT_NUMBERS, by_parts
 from sw_anchors.shape import GROUPS, AnchorShape
 from torch import Tensor, nn
 
-from sw_codecs.context.channel_mixture import PARTS, ChannelMixture, ExactChannelMixture
-from sw_codecs.context.hash_grid import MixedHashGrid
 from sw_codecs.entropy.conditional import RowContext
 from sw_codecs.entropy.conditional_mixture import RowMixture
+from sw_hac.mixed_grid import MixedHashGrid
+from sw_hac.model import context_of
+from sw_hac.predictors import BlockPrediction, row_width, short_features
+from sw_hac_plus.channel_mixture import PARTS, ChannelMixture, ExactChannelMixture
 
 
 @dataclass(frozen=True)

@@ -11,20 +11,19 @@ from typing import TYPE_CHECKING
 import torch
 from sw_anchors.attribute_sections import AttributeDecoder, AttributeEncoder
 from sw_anchors.decoded_anchors import DecodedAnchors
-from sw_anchors.grid_predictors import PREDICTORS
-from sw_anchors.grid_sections import SECTIONS, add_grid, add_header, read_grid, read_header, settled_copy, walk
 from sw_anchors.sections import add_geometry, add_networks, kept_geometry, read_geometry, read_networks
 
 from sw_codecs.context.two_layers import two_layers
+from sw_hac.predictors import PREDICTORS
+from sw_hac.sections import SECTIONS, add_grid, add_header, read_grid, read_header, settled_copy, walk
 
 if TYPE_CHECKING:
-    from sw_anchors.grid_anchors import GridAnchors
-    from sw_anchors.grid_params import GridFileSettings
-
     from splatwizard_core.api import ContainerReader, ContainerWriter
+    from sw_hac.config import FileSettings
+    from sw_hac.model import HACAnchors
 
 
-def encode(model: GridAnchors, writer: ContainerWriter, settings: GridFileSettings) -> None:
+def encode(model: HACAnchors, writer: ContainerWriter, settings: FileSettings) -> None:
     """Write all sections; the model stays as it is."""
     model = settled_copy(model, settings.weights)
     geometry, rows = kept_geometry(model)

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import torch
 from sw_anchors.anchors import linear_layers
+from sw_anchors.fast.predicted_steps import predicted_steps
 from sw_anchors.forecasts import AnchorForecast
-from sw_anchors.predicted_steps import predicted_steps
 from torch import Tensor, nn
 
 from sw_cat_3dgs.context import PLANES, STEP_OFFSET, CatContext

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from sw_cat_3dgs.fast import plane_kernels, wanted
+from splatwizard_native import fast_enabled
+from sw_cat_3dgs.fast import plane_kernels
 from sw_cat_3dgs.plane_fields import NEIGHBORS
 from sw_cat_3dgs.spatial_ar import HIDDEN, LARGEST, P_MIN, RESIDUALS, SMALLEST, SpatialAr
 
@@ -31,7 +32,7 @@ VALUES_AT_ONCE = 1 << 20
 
 def fits(planes: Sequence[Tensor]) -> bool:
     """Whether to compute the bits of these planes here."""
-    return wanted() and all(plane.dtype == planes[0].dtype for plane in planes)
+    return fast_enabled() and all(plane.dtype == planes[0].dtype for plane in planes)
 
 
 def plane_bits(networks: Sequence[SpatialAr], planes: Sequence[Tensor]) -> Tensor:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sw_cat_3dgs.fast import wanted
+from splatwizard_native import fast_enabled
 from sw_cat_3dgs.fast.plane_kernels import fit_kernels, sampled, sampled_backward
 from sw_cat_3dgs.principal_frame import UNIT
 from sw_cat_3dgs.triplane import GAIN, PAIRS, Triplane
@@ -59,7 +59,7 @@ def sites_of(planes: Sequence[Tensor], places: Tensor) -> PlaneSites:
 
 def fits(planes: Sequence[Tensor]) -> bool:
     """Whether there are kernels for these planes [3, C, R, R]; loads them."""
-    if not wanted():
+    if not fast_enabled():
         return False
     if all(plane.device.type == "cpu" and plane.dtype == torch.float32 for plane in planes):
         return 0 < len(planes) <= MOST_SCALES and planes[0].numel() > 0 and CODECS.try_load()

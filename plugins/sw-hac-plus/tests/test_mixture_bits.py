@@ -2,12 +2,12 @@
 
 import pytest
 import torch
-from sw_anchors.channel_networks import ChannelNetworks
-from sw_anchors.mixture_bits import MaskKind, Predicted, fit_mixture_kernel, mixture_bits
+from sw_anchors.fast.mixture_bits import MaskKind, Predicted, fit_mixture_kernel, mixture_bits
 from sw_anchors.native import ANCHORS
 
-from sw_codecs.context.channel_mixture import ChannelMixture
 from sw_codecs.entropy import rates
+from sw_hac_plus.channel_mixture import ChannelMixture
+from sw_hac_plus.fast.channel_networks import ChannelNetworks
 
 ON_CUDA = ANCHORS.available(cuda=True)
 DEVICES = [

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from sw_codecs.context.channel_mixture import LEAK, ChannelMixture
+from sw_hac_plus.channel_mixture import LEAK, ChannelMixture
 
 SLICES = (2, 3, 4)
 

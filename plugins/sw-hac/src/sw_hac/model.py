@@ -11,30 +11,27 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
+from sw_anchors.anchors import linear_layers
+from sw_anchors.coded_anchors import CodedAnchors
+from sw_anchors.fast.predicted_steps import predicted_steps
+from sw_anchors.forecasts import AnchorContext, AnchorForecast
+from sw_anchors.lattice import TOP
+from sw_anchors.shape import AnchorShape
 from torch import Tensor, nn
 
 from splatwizard_core.api import SceneError
-from sw_anchors.anchors import linear_layers
-from sw_anchors.coded_anchors import CodedAnchors
-from sw_anchors.forecasts import AnchorContext, AnchorForecast
-from sw_anchors.lattice import TOP
-from sw_anchors.predicted_steps import predicted_steps
-from sw_anchors.shape import AnchorShape
-from sw_codecs.context.hash_grid import GridPlaces, MixedHashGrid
 from sw_codecs.context.two_layers import two_layers
+from sw_hac.mixed_grid import MixedHashGrid
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Scene
-    from sw_anchors.grid_params import GridAnchorParams
+    from sw_hac.config import HACParams
 
 SMALLEST_STEP = 1 / 64
 """Of the base step. The published 1 + tanh t can underflow to 0, and the coder's table of steps ends here."""
 
-PLACES_LIMIT = 1 << 30
-"""Bytes that the places of all anchors in the grid may take to be kept, 1,152 an anchor in the published one."""
 
-
-class GridAnchors(CodedAnchors):
+class HACAnchors(CodedAnchors):
     """CodedAnchors with the grid and its network.
 
     grid        hash grid over the box of the anchors, signs
@@ -72,7 +69,7 @@ class GridAnchors(CodedAnchors):
         self.register_buffer("units", torch.tensor(units).repeat_interleave(torch.tensor(widths)).to(self.features))
 
     @classmethod
-    def of_scene(cls, scene: Scene, config: GridAnchorParams, generator: torch.Generator, **kwargs: Any) -> GridAnchors:
+    def of_scene(cls, scene: Scene, config: HACParams, generator: torch.Generator, **kwargs: Any) -> HACAnchors:
         """Put an anchor into every voxel with a start point of the scene; kwargs as of the constructor.
 
         Raises SceneError if there is none.
@@ -104,18 +101,15 @@ class GridAnchors(CodedAnchors):
         return {name: getattr(self, name) for name in (*self.NETWORKS, "mlp_grid")}
 
     def context_rows(self) -> tuple[Tensor, ...]:
-        """Positions of the anchors in the grid's cube; or their GridPlaces, if there is no kernel and they fit."""
+        """Positions of the anchors in the grid's cube."""
         codes = self.codes()
         if self._places is None or self._places[0] is not codes:
-            x = codes.to(self.features) / TOP
-            kept = not self.grid.has_kernel(x) and len(codes) * self.grid.place_bytes <= PLACES_LIMIT
-            self._places = None  # the old ones go before the new ones come
-            self._places = (codes, tuple(self.grid.places(x)) if kept else (x,))
+            self._places = (codes, (codes.to(self.features) / TOP,))
         return self._places[1]
 
     def _looked_up(self, parts: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
         """Look up features of the grid at rows of `context_rows`; and the bits of its signs."""
-        return self.grid.with_bits(parts[0]) if len(parts) == 1 else self.grid.at_places(GridPlaces(*parts))
+        return self.grid.with_bits(*parts)
 
     def forecast_at(self, parts: tuple[Tensor, ...]) -> AnchorForecast:
         features, bits = self._looked_up(parts)

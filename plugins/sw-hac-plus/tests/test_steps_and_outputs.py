@@ -2,7 +2,8 @@
 
 import pytest
 import torch
-from sw_anchors.predicted_outputs import steps_and_outputs
+
+from sw_hac_plus.fast.steps_and_outputs import steps_and_outputs
 
 
 def by_torch(features, parameters, base, *, part, start, offset, smallest):

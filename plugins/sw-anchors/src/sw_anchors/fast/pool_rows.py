@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from sw_anchors.fused_ops import load_rows
+from sw_anchors.fast.fused_ops import load_rows
 
 if TYPE_CHECKING:
     from sw_anchors.coded_anchors import CodedAnchors

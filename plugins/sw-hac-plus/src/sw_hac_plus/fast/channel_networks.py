@@ -12,8 +12,8 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from sw_codecs.context.channel_mixture import LEAK, PARTS, ChannelMixture
 from sw_codecs.context.integer_mlp import FRACTION
+from sw_hac_plus.channel_mixture import LEAK, PARTS, ChannelMixture
 
 UNIT = 4
 """Widths of matrices are multiples of it, so that GPUs read 16 bytes at once."""

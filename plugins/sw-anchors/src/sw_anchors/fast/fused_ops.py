@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sw_anchors import row_kernels
-from sw_anchors.row_kernels import NoisyRows, SampleBits, bits_fit_kernel, fit_kernels
+from sw_anchors.fast import row_kernels
+from sw_anchors.fast.row_kernels import NoisyRows, SampleBits, bits_fit_kernel, fit_kernels
 from sw_codecs.entropy.rates import gaussian_bits
 
 

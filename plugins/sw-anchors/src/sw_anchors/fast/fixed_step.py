@@ -18,13 +18,13 @@ from torch import Tensor
 from splatwizard_core.api import Camera, GaussianInputs
 from sw_anchors.anchors import AnchorSelection
 from sw_anchors.coded_anchors import ENTROPY, MASK_THRESHOLD, QUANTIZED
+from sw_anchors.fast.fused_ops import load_rows, noisy_rows
+from sw_anchors.fast.pool_rows import PoolRows
+from sw_anchors.fast.seen_rows import SeenRows
+from sw_anchors.fast.step_graphs import Found
+from sw_anchors.fast.view_networks import network_outputs
 from sw_anchors.forecasts import AnchorRate
-from sw_anchors.fused_ops import load_rows, noisy_rows
 from sw_anchors.neural_gaussians import visible_gaussians
-from sw_anchors.pool_rows import PoolRows
-from sw_anchors.seen_rows import SeenRows
-from sw_anchors.step_graphs import Found
-from sw_anchors.view_networks import network_outputs
 
 if TYPE_CHECKING:
     from sw_anchors.coded_anchors import CodedAnchors

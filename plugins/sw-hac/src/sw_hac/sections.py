@@ -12,21 +12,22 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
-from torch import Tensor
-
 from sw_anchors.attribute_sections import AttributeCoder, Block
 from sw_anchors.coded_anchors import ENTROPY
 from sw_anchors.float_mode import Mode, add_machine, read_mode
-from sw_anchors.grid_anchors import GridAnchors
 from sw_anchors.header import read_base_steps, read_integers
 from sw_anchors.sections import AnchorGeometry, WeightType, round_networks
 from sw_anchors.shape import AnchorShape
-from sw_codecs.context.hash_grid import HashGrid, MixedHashGrid
+from torch import Tensor
+
+from sw_codecs.context.hash_grid import HashGrid
 from sw_codecs.entropy.bernoulli import Bernoulli
+from sw_hac.mixed_grid import MixedHashGrid
+from sw_hac.model import HACAnchors
 
 if TYPE_CHECKING:
     from splatwizard_core.api import ContainerReader, ContainerWriter
-    from sw_anchors.grid_predictors import BlockPrediction
+    from sw_hac.predictors import BlockPrediction
 
 log = logging.getLogger(__name__)
 
@@ -35,11 +36,11 @@ SECTIONS = {"features": "features", "scales": "scalings", "offsets": "offsets"}
 LIMITS = {"feature_dim": 256, "hidden": 256, "grid_hidden": 256, "grid_features": 16}
 """Largest value of a size in the header."""
 
-Model = TypeVar("Model", bound=GridAnchors)
+Model = TypeVar("Model", bound=HACAnchors)
 
 
 @dataclass(frozen=True)
-class GridHeader:
+class HACHeader:
     """Header values of a file: coder mode, base steps, sizes of anchors and networks; `grid_features` bits a vertex."""
 
     mode: Mode
@@ -62,7 +63,7 @@ def settled_copy(model: Model, weights: WeightType) -> Model:
     return model
 
 
-def add_header(model: GridAnchors, writer: ContainerWriter, mode: Mode) -> None:
+def add_header(model: HACAnchors, writer: ContainerWriter, mode: Mode) -> None:
     """Add the header values that say how the sections are to be read."""
     space, planes = model.grid.grids[0], model.grid.grids[1]
     assert isinstance(space, HashGrid)
@@ -81,7 +82,7 @@ def add_header(model: GridAnchors, writer: ContainerWriter, mode: Mode) -> None:
     add_machine(writer, mode)
 
 
-def read_header(reader: ContainerReader) -> GridHeader:
+def read_header(reader: ContainerReader) -> HACHeader:
     """Inverse of `add_header`, without the grid. Raises BitstreamError."""
     feature_dim, hidden, grid_hidden, grid_features = (
         reader.integer(name, low=1, high=high) for name, high in LIMITS.items()
@@ -89,7 +90,7 @@ def read_header(reader: ContainerReader) -> GridHeader:
     mode = read_mode(reader)
     base_steps = read_base_steps(reader, low=1e-6, high=1e3)
     shape = AnchorShape(feature_dim, reader.integer("num_offsets", low=1, high=64))
-    return GridHeader(mode, base_steps, shape, hidden, grid_hidden, grid_features)
+    return HACHeader(mode, base_steps, shape, hidden, grid_hidden, grid_features)
 
 
 def add_grid(writer: ContainerWriter, grid: MixedHashGrid) -> None:

@@ -1,16 +1,17 @@
-"""Training stage of anchors that a hash grid predicts: that of all anchor methods with a rate, and three phases."""
+"""Training stage of HAC: that of all anchor methods with a rate, and three phases."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 from sw_anchors.coded_anchors import ENTROPY, QUANTIZED
+from sw_anchors.fast.fused_ops import Weighted
 from sw_anchors.forecasts import AnchorRate
-from sw_anchors.fused_ops import Weighted
-from sw_anchors.grid_anchors import GridAnchors
-from sw_anchors.grid_params import GridAnchorParams
 from sw_anchors.phase_switch import PhaseSwitch
 from sw_anchors.stage import CodedAnchorStage
+
+from sw_hac.config import HACParams
+from sw_hac.model import HACAnchors
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -18,10 +19,14 @@ if TYPE_CHECKING:
     from splatwizard_core.api import OptimizationParams, PipelineParams, RenderResult, Scheduler
 
 
-class GridStage(CodedAnchorStage):
-    """Three phases: raw values, noise of fixed steps, noise of predicted steps with the bits in the loss."""
+class HACStage(CodedAnchorStage):
+    """One stage of 30,000 steps in three phases.
 
-    opt: GridAnchorParams
+    Raw values; noise of fixed steps; noise of predicted steps with the bits in the loss.
+    """
+
+    name = "hac"
+    opt: HACParams
 
     def learning_rates(self, step: int) -> Mapping[str, float]:
         lr = self.opt.lr
@@ -40,11 +45,11 @@ class GridStage(CodedAnchorStage):
         if self.opt.rate_term.start == "statistics":
             scheduler.register_task(self.at(phases.entropy), self.start_from_statistics)
 
-    def start_from_statistics(self, model: GridAnchors) -> None:
+    def start_from_statistics(self, model: HACAnchors) -> None:
         """Let the network predict from statistics of the values."""
         model.start_from_statistics()
 
-    def extra_loss(self, model: GridAnchors, result: RenderResult, step: int) -> dict[str, Weighted]:
+    def extra_loss(self, model: HACAnchors, result: RenderResult, step: int) -> dict[str, Weighted]:
         rate: AnchorRate | None = result.extras.get("rate")
         if rate is None:
             return {}

@@ -9,10 +9,9 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from sw_anchors.fast.predicted_steps import steps_by_torch, steps_fit_kernel
 from torch import Tensor
 from torch.autograd.function import once_differentiable
-
-from sw_anchors.predicted_steps import steps_by_torch, steps_fit_kernel
 
 Parameters = tuple[Tensor, Tensor, Tensor, Tensor]
 

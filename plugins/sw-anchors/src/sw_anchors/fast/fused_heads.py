@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from sw_anchors.fast.view_networks import Networks, parameters_of
 from sw_anchors.native import ANCHORS
-from sw_anchors.view_networks import Networks, parameters_of
 
 
 def fits_kernel(positions: Tensor, tensors: tuple[Tensor | None, ...], networks: Networks) -> bool:

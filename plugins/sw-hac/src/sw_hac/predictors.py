@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
-from torch import Tensor, nn
-
 from sw_anchors.attribute_sections import ExactNetwork
 from sw_anchors.float_mode import Mode, one_thread
-from sw_anchors.grid_anchors import context_of
 from sw_anchors.lattice import TOP
 from sw_anchors.row_parts import FLOAT_NUMBERS, by_parts
 from sw_anchors.shape import GROUPS, AnchorShape
-from sw_codecs.context.hash_grid import MixedHashGrid
+from torch import Tensor, nn
+
 from sw_codecs.entropy.conditional import RowContext
 from sw_codecs.entropy.lattice import RowLattice
+from sw_hac.mixed_grid import MixedHashGrid
+from sw_hac.model import context_of
 
 BlockPrediction = dict[str, tuple[RowContext | RowLattice, Tensor]]
 """Group -> its distributions for a block of n anchors, and quantiser steps [n,1] float64 in units of the values."""

@@ -15,9 +15,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from torch import Tensor
-
-from splatwizard_core.api import BitstreamError
 from sw_anchors.lattice import position_codes
 from sw_anchors.sections import (
     BOUNDS_BYTES,
@@ -28,11 +25,15 @@ from sw_anchors.sections import (
     read_counts,
     read_masks,
 )
+from torch import Tensor
+
+from splatwizard_core.api import BitstreamError
 from sw_codecs.positions.octree import Octree
 
 if TYPE_CHECKING:
-    from splatwizard_core.api import ContainerReader, ContainerWriter
     from sw_anchors.coded_anchors import CodedAnchors
+
+    from splatwizard_core.api import ContainerReader, ContainerWriter
 
 MOST_BITS = 21
 """Of an axis of the octree."""

@@ -1,6 +1,6 @@
 """Bits of a sample of anchors straight from what networks predict, with their derivatives: one node, one kernel.
 
-Means, deviations and weights need no tensors of their own. `ChannelNetworks` are part of the node: they see the numbers
+Means, deviations and weights need no tensors of their own. `Networks` are part of the node: they see the numbers
 whose bits are counted, and so both gradients are added where they are written.
 """
 
@@ -8,14 +8,44 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sw_anchors.channel_networks import ChannelNetworks
-from sw_anchors.row_kernels import bits_fit_kernel, summed_bits
+from sw_anchors.fast.row_kernels import bits_fit_kernel, summed_bits
+
+
+class Networks(Protocol):
+    """Networks that give the second Gaussian of each feature, from the numbers whose bits are counted.
+
+    context     whether they see the prediction of the first Gaussian
+    columns     [3,F] int32: columns of mean, scale and logit of each feature in their outputs
+    """
+
+    context: bool
+    columns: Tensor
+
+    def check_for(self, features: int, device: torch.device) -> None:
+        """Raise ValueError unless they are of so many features, and on that device."""
+        ...
+
+    def packed(self, parameters: tuple[Tensor, ...]) -> Tensor:
+        """Return all weights in a row."""
+        ...
+
+    def unpacked(self, packed: Tensor, factor: Tensor) -> list[Tensor]:
+        """Return the numbers of each parameter among packed ones, times a scalar."""
+        ...
+
+    def forward(self, packed: Tensor, inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Return hidden layers and outputs."""
+        ...
+
+    def backward(self, packed: Tensor, inputs: Tensor, hidden: Tensor, slopes: Tensor) -> tuple[Tensor, Tensor]:
+        """Return gradients by inputs and packed weights from those by the outputs."""
+        ...
 
 
 class MaskKind(IntEnum):
@@ -58,7 +88,7 @@ def mixture_bits(
     masks: Tensor,
     counted: Tensor,
     predicted: Predicted,
-    networks: ChannelNetworks | None = None,
+    networks: Networks | None = None,
     parameters: tuple[Tensor, ...] = (),
 ) -> tuple[Tensor, Tensor]:
     """(bits of S anchors, differentiable; the same by group [3]), where `fit_mixture_kernel` says so.
@@ -91,7 +121,7 @@ class _MixtureBits(torch.autograd.Function):
         masks: Tensor,
         counted: Tensor,
         predicted: Predicted,
-        networks: ChannelNetworks | None,
+        networks: Networks | None,
         *parameters: Tensor,
     ) -> tuple[Tensor, Tensor]:
         p, features = predicted, x.shape[1] - 6 - 3 * masks.shape[1]
@@ -116,7 +146,7 @@ class _MixtureBits(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, slope: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         by_x, by_outputs, by_steps, by_masks, *rest = ctx.saved_tensors
-        networks: ChannelNetworks | None = ctx.networks
+        networks: Networks | None = ctx.networks
         to_inputs, to_parameters = None, []
         if networks is not None:
             by_second, packed, inputs, hidden = rest

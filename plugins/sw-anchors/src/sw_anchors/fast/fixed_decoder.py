@@ -20,11 +20,11 @@ from torch.autograd.function import once_differentiable
 
 from splatwizard_core.api import Camera, GaussianInputs
 from sw_anchors.coded_anchors import ENTROPY
-from sw_anchors.fixed_step import PARAMETERS, FixedRows, decode_rows, inputs_of, sample_capacity
-from sw_anchors.fused_ops import add_rows, put_rows
-from sw_anchors.pool_rows import PoolRows
-from sw_anchors.seen_rows import SeenRows, capacity_of
-from sw_anchors.step_graphs import CapturedStep, FixedStep, PlainStep, Watched, add_gradients
+from sw_anchors.fast.fixed_step import PARAMETERS, FixedRows, decode_rows, inputs_of, sample_capacity
+from sw_anchors.fast.fused_ops import add_rows, put_rows
+from sw_anchors.fast.pool_rows import PoolRows
+from sw_anchors.fast.seen_rows import SeenRows, capacity_of
+from sw_anchors.fast.step_graphs import CapturedStep, FixedStep, PlainStep, Watched, add_gradients
 
 if TYPE_CHECKING:
     from sw_anchors.coded_anchors import CodedAnchors
