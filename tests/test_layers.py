@@ -132,10 +132,9 @@ CLOSURES = {
 """Method -> the most modules and lines of its closure, where not (45, 4,500)."""
 CLOSURE = (45, 4_500)
 NOT_YET = {
-    "sw_cat_3dgs.method": (71, 8_850),
     "sw_compact3dgs.method": (52, 5_390),
-    "sw_hac.method": (64, 7_930),
-    "sw_hac_plus.method": (71, 8_890),
+    "sw_hac.method": (45, 5_180),
+    "sw_hac_plus.method": (52, 6_130),
     "sw_trimgs.surfel_method": (46, 5_010),
 }
 """Closures that are larger than that today; they may shrink, and go from here once they fit."""

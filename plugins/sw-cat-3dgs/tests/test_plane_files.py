@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import numpy as np
+import plane_lists
 import pytest
 import torch
 
@@ -81,9 +82,9 @@ def test_planes_are_coded(case, kernels, monkeypatch):
     planes = [np.rint(r.laplace(0, 3, (3, *shape))).astype(np.int64) for shape in shapes]
     for plane in planes:
         plane.reshape(-1)[::40] += 70_000  # escapes
-    coded = both(kernels, lambda: SpatialAr.encode(planes, models))
+    coded = both(kernels, lambda: plane_lists.encode(planes, models))
     assert coded[0] == coded[1]
-    for found in both(kernels, lambda: SpatialAr.decode(coded[0], shapes, models)):
+    for found in both(kernels, lambda: plane_lists.decode(coded[0], shapes, models)):
         assert all(np.array_equal(a, b) for a, b in zip(found, planes, strict=True))
 
 
@@ -93,19 +94,19 @@ def test_damaged_planes_are_refused(compiled, kernels, monkeypatch):
     models = spatial_models(1)
     plane = np.rint(np.random.default_rng(0).laplace(0, 40, (1, 3, 2, 3))).astype(np.int64)
     kernels(compiled)
-    data = SpatialAr.encode([plane], models)
-    check_damage(data, lambda d: SpatialAr.decode(d, [(3, 2, 3)], models)[0], plane, masks=(0x81,))
+    data = plane_lists.encode([plane], models)
+    check_damage(data, lambda d: plane_lists.decode(d, [(3, 2, 3)], models)[0], plane, masks=(0x81,))
 
 
 def test_streams_of_no_or_of_too_many_channels_are_refused():
     models, plane = spatial_models(1), np.ones((1, 4, 3, 3), np.int64)
-    data = bytearray(SpatialAr.encode([plane], models))
+    data = bytearray(plane_lists.encode([plane], models))
     place = len(exact_streams.prefix()) + 4
     assert data[place] == 4
     for channels in (0, 5):
         data[place] = channels
         with pytest.raises(BitstreamError):
-            SpatialAr.decode(bytes(data), [(4, 3, 3)], models)
+            plane_lists.decode(bytes(data), [(4, 3, 3)], models)
 
 
 def test_threads_change_no_plane(kernels):
@@ -116,7 +117,7 @@ def test_threads_change_no_plane(kernels):
     try:
         for threads in (1, 2, 5):
             torch.set_num_threads(threads)
-            found.add(SpatialAr.encode(planes, models))
+            found.add(plane_lists.encode(planes, models))
     finally:
         torch.set_num_threads(kept)
     assert len(found) == 1

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import plane_lists
 import pytest
 import torch
 from hypothesis import given, settings
@@ -12,11 +13,12 @@ from hypothesis import strategies as st
 
 from splatwizard_core.errors import BitstreamError
 from splatwizard_core.plugins import load_plugins
-from sw_cat_3dgs.plane_fields import NEIGHBORS, Field
-from sw_cat_3dgs.spatial_ar import SpatialAr
+from sw_cat_3dgs.plane_coder import PlaneCoder, PlaneContext
+from sw_cat_3dgs.plane_fields import Field
+from sw_cat_3dgs.spatial_ar import NEIGHBORS, SpatialAr
 from sw_codecs.entropy.exact_tables import exact_tables
 from sw_codecs.exact_native import EXACT
-from sw_codecs.testing import check_context_model, check_damage
+from sw_codecs.testing import EntropyCase, check_context_model, check_damage, check_entropy_model
 
 
 def network(seed=0, scale=1.0):
@@ -57,29 +59,30 @@ def test_a_value_changes_predictions_only_at_later_wavefronts():
 def test_planes_of_any_size_come_back(size):
     networks = exact_networks(2)
     planes = [drawn(2, 3, *size), drawn(2, 5, 2 * size[0], size[1], seed=1)]
-    data = SpatialAr.encode(planes, networks)
-    found = SpatialAr.decode(data, [(3, *size), (5, 2 * size[0], size[1])], networks)
+    data = plane_lists.encode(planes, networks)
+    found = plane_lists.decode(data, [(3, *size), (5, 2 * size[0], size[1])], networks)
     assert all(np.array_equal(a, b) for a, b in zip(found, planes, strict=True))
 
 
 def test_nothing_comes_back_as_nothing():
     networks = exact_networks(1)
-    assert SpatialAr.decode(SpatialAr.encode([], networks), [], networks) == []
+    assert plane_lists.decode(plane_lists.encode([], networks), [], networks) == []
     empty = np.zeros((1, 0, 4, 4), np.int64)
-    assert SpatialAr.decode(SpatialAr.encode([empty], networks), [(0, 4, 4)], networks)[0].shape == empty.shape
+    assert plane_lists.decode(plane_lists.encode([empty], networks), [(0, 4, 4)], networks)[0].shape == empty.shape
 
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(1, 3), st.integers(1, 5), st.integers(1, 5), st.integers(0, 99), st.sampled_from([0.1, 3.0, 1e5]))
 def test_any_values_come_back(channels, height, width, seed, spread):
     networks, planes = exact_networks(1), [drawn(1, channels, height, width, seed=seed, spread=spread)]
-    found = SpatialAr.decode(SpatialAr.encode(planes, networks), [(channels, height, width)], networks)
+    found = plane_lists.decode(plane_lists.encode(planes, networks), [(channels, height, width)], networks)
     assert np.array_equal(found[0], planes[0])
 
 
 MEMORY = """
 import sys, torch
 from pathlib import Path
+from sw_cat_3dgs.plane_coder import PlaneCoder, PlaneContext
 from sw_cat_3dgs.spatial_ar import SpatialAr
 
 def kilobytes(name):
@@ -87,10 +90,10 @@ def kilobytes(name):
 
 torch.set_num_threads(3)
 networks = [SpatialAr.exact(SpatialAr(torch.Generator().manual_seed(seed)).state()) for seed in range(3)]
-one = SpatialAr.decode(Path(sys.argv[2]).read_bytes(), [(1, 4, 4)], networks)  # the kernel is loaded
+one = PlaneCoder().decode(Path(sys.argv[2]).read_bytes(), PlaneContext(networks, [(1, 4, 4)]))  # the kernel is loaded
 data = Path(sys.argv[1]).read_bytes()
 before = kilobytes("VmRSS:")
-SpatialAr.decode(data, [(1, 700, 700)], networks)
+PlaneCoder().decode(data, PlaneContext(networks, [(1, 700, 700)]))
 print((kilobytes("VmHWM:") - before) * 1024)
 """
 
@@ -101,7 +104,7 @@ def test_planes_of_one_channel_take_no_more_than_their_size_allows(tmp_path):
         pytest.skip("no compiler: nothing is decoded side by side")
     networks = [SpatialAr.exact(SpatialAr(torch.Generator().manual_seed(seed)).state()) for seed in range(3)]
     for name, size in (("large", 700), ("small", 4)):
-        (tmp_path / name).write_bytes(SpatialAr.encode([np.zeros((3, 1, size, size), np.int64)], networks))
+        (tmp_path / name).write_bytes(plane_lists.encode([np.zeros((3, 1, size, size), np.int64)], networks))
     command = [sys.executable, "-c", MEMORY, str(tmp_path / "large"), str(tmp_path / "small")]
     found = subprocess.run(command, capture_output=True, text=True, check=True)
     assert int(found.stdout) < 4 * (4 * 3 * 700 * 700)  # integers of 32 bits
@@ -140,8 +143,8 @@ def test_the_estimate_is_what_is_coded():
     made = [network(seed, scale=0.3) for seed in range(3)]
     networks = [SpatialAr.exact(each.state()) for each in made]
     planes = drawn(3, 10, 60, 60, spread=1.5)
-    size = 8 * len(SpatialAr.encode([planes], networks))
-    tables = SpatialAr.table_bits([planes], networks)
+    size = 8 * len(plane_lists.encode([planes], networks))
+    tables = plane_lists.table_bits([planes], networks)
     floats = sum(float(made[k].bits(torch.from_numpy(planes[k]).float()).detach().sum()) for k in range(3))
     assert abs(size / tables - 1) < 2e-3
     assert abs(size / floats - 1) < 0.02
@@ -149,10 +152,10 @@ def test_the_estimate_is_what_is_coded():
 
 def test_damage_is_refused():
     networks, planes = exact_networks(1), [drawn(1, 2, 4, 5, spread=40.0)]
-    data = SpatialAr.encode(planes, networks)
-    check_damage(data, lambda d: SpatialAr.decode(d, [(2, 4, 5)], networks)[0], planes[0], masks=(0x01, 0x80))
+    data = plane_lists.encode(planes, networks)
+    check_damage(data, lambda d: plane_lists.decode(d, [(2, 4, 5)], networks)[0], planes[0], masks=(0x01, 0x80))
     with pytest.raises(BitstreamError):
-        SpatialAr.decode(data, [(2, 4, 5)], [SpatialAr.exact(network(7, scale=5).state())])
+        plane_lists.decode(data, [(2, 4, 5)], [SpatialAr.exact(network(7, scale=5).state())])
 
 
 def test_weights_that_make_no_network_are_refused():
@@ -193,3 +196,17 @@ def test_gradients_pull_a_scale_back_into_the_range_of_the_coder():
 def test_it_is_the_context_model_that_files_name():
     assert load_plugins().context_models.load("spatial-ar") is SpatialAr
     check_context_model(SpatialAr(), torch.zeros(2, 5, 6))
+
+
+def planes_case(n):
+    """About n integers that follow their models, three orientations at two scales."""
+    networks, side = exact_networks(), 10
+    channels = -(-n // (15 * side * side))
+    planes = [drawn(3, channels, m * side, m * side, seed=m, spread=1.5) for m in (1, 2)]
+    context = PlaneContext(networks, [plane.shape[1:] for plane in planes])
+    return EntropyCase(context.join(planes), context, context, context)
+
+
+def test_planes_in_a_file_keep_the_contract():
+    assert load_plugins().entropy_models.load("wavefront") is PlaneCoder
+    check_entropy_model(PlaneCoder, planes_case)

@@ -112,7 +112,7 @@ QUICK = {
 """Settings with which a coder that trains a codebook takes no minutes."""
 
 
-@pytest.mark.parametrize("name", ours(PLUGINS.entropy_models.names))
+@pytest.mark.parametrize("name", own(PLUGINS.entropy_models.names))
 def test_entropy_models(name):
     testing.check_entropy_model(PLUGINS.entropy_models.load(name), ENTROPY_CASES[name])
 

@@ -12,7 +12,7 @@ from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.runs.config import apply_overrides
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene
-from sw_codecs.entropy.conditional_mixture import RowMixture
+from sw_codecs.entropy.rows import RowMixture
 from sw_hac_plus import codec
 from sw_hac_plus.config import HACPlusConfig
 from sw_hac_plus.method import HACPlus
@@ -93,7 +93,7 @@ def recorded(model, mode="exact"):
     model.fold_units()
     round_networks(model.networks(), "float32")
     geometry, rows = kept_voxels(model)
-    recorder = Recorder(model, rows, codec.sections(model.channel), mode)
+    recorder = Recorder(model, rows, codec.sections(model.channel), mode, PLUGINS)
     with torch.no_grad():
         codec.Walk(mode, model.grid, model.mlp_grid, model.channel, model.shape, model.base_steps)(recorder, geometry)
     return recorder, geometry

@@ -30,10 +30,10 @@ KINDS = ["full", "tiny", "none"]
 
 
 def test_the_header_lists_what_decoding_needs():
-    writer = ContainerWriter("hac-plus", 1)
-    with torch.no_grad():
-        codec.encode(make(n=20), writer, method().config.codec.settings)
-    assert set(writer.required) == {
+    writer, made = ContainerWriter("hac-plus", 1), method()
+    with torch.no_grad(), made.plugins.recording() as loaded:
+        codec.encode(make(n=20), writer, made.config.codec.settings, made.plugins)
+    assert {*((entry.kind, entry.name) for entry in loaded), *writer.required} == {
         ("coder", "octree"), ("entropy model", "bernoulli"), ("context model", "integer-mlp"),
         ("context model", "channel-mixture"), ("entropy model", "conditional-mixture"),
         ("entropy model", "conditional-gaussian"),

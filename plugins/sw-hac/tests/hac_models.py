@@ -103,12 +103,12 @@ def lattice_of(model, *, mode="exact", **values):
     settings = method(codec__settings__mode=mode, **values).config.codec.settings
     writer, again = ContainerWriter("hac", 1), ContainerWriter("hac", 1)
     with torch.no_grad():
-        codec.encode(model, writer, settings)
+        codec.encode(model, writer, settings, PLUGINS)
         model = copy.deepcopy(model)
         model.fold_units()
         round_networks(model.networks(), settings.weights)
         geometry, rows = kept_geometry(model)
-        recorder = Recorder(model, rows, list(codec.SECTIONS.values()), mode)
+        recorder = Recorder(model, rows, list(codec.SECTIONS.values()), mode, PLUGINS)
         codec.walk(recorder, predictor(model, mode), geometry)
         recorder.write(again)
     stored = ContainerReader(writer.to_bytes()), ContainerReader(again.to_bytes())

@@ -27,8 +27,8 @@ from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.runs import measure
 from splatwizard_core.runs.session import Session
 from splatwizard_core.scene.scene import Protocol
-from sw_codecs.entropy.conditional import RowContext
-from sw_codecs.entropy.lattice import RowLattice, lattice
+from sw_codecs.entropy.lattice import lattice
+from sw_codecs.entropy.rows import RowContext, RowLattice
 from sw_hac import codec
 from sw_hac.method import HAC
 from sw_hac.predictors import PREDICTORS
@@ -38,12 +38,13 @@ SECTIONS = ["anchors", "masks", "grids", "networks", "features", "scalings", "of
 
 
 def test_the_header_lists_what_decoding_needs():
-    writer = ContainerWriter("hac", 1)
-    codec.encode(make(n=20), writer, method().config.codec.settings)
-    assert list(dict.fromkeys(writer.required)) == [
+    writer, made = ContainerWriter("hac", 1), method()
+    with made.plugins.recording() as loaded:
+        codec.encode(make(n=20), writer, made.config.codec.settings, made.plugins)
+    assert {*((entry.kind, entry.name) for entry in loaded), *writer.required} == {
         ("coder", "octree"), ("entropy model", "bernoulli"), ("context model", "integer-mlp"),
         ("entropy model", "conditional-gaussian"),
-    ]  # fmt: skip
+    }  # fmt: skip
 
 
 def test_a_file_has_a_section_for_everything():

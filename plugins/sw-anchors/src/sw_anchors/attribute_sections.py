@@ -8,6 +8,7 @@ walk hands them to an `AttributeEncoder`, which rounds the values of a model and
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -18,17 +19,17 @@ from splatwizard_core.api import BitstreamError
 from sw_anchors.row_parts import EXACT_NUMBERS, parts_of
 from sw_anchors.shape import GROUPS, AnchorShape
 from sw_codecs.context.integer_mlp import FRACTION, IntegerMlp
-from sw_codecs.entropy.conditional import ConditionalGaussian, RowContext
-from sw_codecs.entropy.conditional_mixture import ConditionalMixture, RowMixture
-from sw_codecs.entropy.exact_tables import exact_tables
-from sw_codecs.entropy.lattice import RowLattice
+from sw_codecs.entropy.exact_tables import exact_tables, step_multipliers
+from sw_codecs.entropy.rows import RowContext, RowLattice, RowMixture
 from sw_codecs.exact_native import EXACT
 from sw_codecs.quantizers.rounding import SteRound
 
 if TYPE_CHECKING:
-    from splatwizard_core.api import ContainerReader, ContainerWriter
+    from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager
     from sw_anchors.coded_anchors import CodedAnchors
     from sw_anchors.decoded_anchors import DecodedAnchors
+    from sw_codecs.entropy.conditional import ConditionalGaussian
+    from sw_codecs.entropy.conditional_mixture import ConditionalMixture
 
 
 class Block(NamedTuple):
@@ -46,11 +47,17 @@ class AttributeCoder:
     rows        the blocks of rows that a walk goes over, in order
     """
 
-    def __init__(self, count: int, shape: AnchorShape, mode: str) -> None:
+    def __init__(self, count: int, shape: AnchorShape, mode: str, plugins: PluginManager) -> None:
         """Of `count` anchors, in mode "exact" or "float" of the entropy model `conditional-gaussian`."""
-        self.coder = ConditionalGaussian(mode)
-        self.mixtures = ConditionalMixture(mode)
+        self._mode, self._plugins = mode, plugins
+        self.coder: ConditionalGaussian = plugins.entropy_models.load("conditional-gaussian")(mode)
         self.rows = self.coder.blocks(count, max(shape.widths))
+
+    @cached_property
+    def mixtures(self) -> ConditionalMixture:
+        """Coder of mixtures, asked for where a block has some."""
+        found: ConditionalMixture = self._plugins.entropy_models.load("conditional-mixture")(self._mode)
+        return found
 
     def code(
         self, block: Block, context: RowContext | RowLattice | RowMixture, step: Tensor, present: Tensor | None = None
@@ -67,8 +74,10 @@ class AttributeCoder:
 class AttributeEncoder(AttributeCoder):
     """Rounds the attributes of a model's anchors `rows` [N] (their order in the file) and codes them."""
 
-    def __init__(self, model: CodedAnchors, rows: Tensor, sections: Sequence[str], mode: str) -> None:
-        super().__init__(len(rows), model.shape, mode)
+    def __init__(
+        self, model: CodedAnchors, rows: Tensor, sections: Sequence[str], mode: str, plugins: PluginManager
+    ) -> None:
+        super().__init__(len(rows), model.shape, mode, plugins)
         self._values = dict(zip(GROUPS, (v.detach().cpu() for v in model.raw(rows)), strict=True))
         self._centres = dict(zip(GROUPS, (c.cpu() for c in model.centres()), strict=True))
         self._coded: dict[str, list[bytes]] = {name: [] for name in sections}
@@ -89,7 +98,6 @@ class AttributeEncoder(AttributeCoder):
 
     def write(self, writer: ContainerWriter) -> None:
         """Add all sections, after the walk."""
-        writer.require("entropy model", "conditional-gaussian")
         for name, blocks in self._coded.items():
             writer.add(name, self.coder.join(blocks))
 
@@ -97,10 +105,12 @@ class AttributeEncoder(AttributeCoder):
 class AttributeDecoder(AttributeCoder):
     """Reads what an AttributeEncoder wrote into a DecodedAnchors; errors name the section."""
 
-    def __init__(self, reader: ContainerReader, model: DecodedAnchors, sections: Sequence[str], mode: str) -> None:
+    def __init__(
+        self, reader: ContainerReader, model: DecodedAnchors, sections: Sequence[str], mode: str, plugins: PluginManager
+    ) -> None:
         """Raises BitstreamError if a section is missing."""
         shape = AnchorShape(model.features.shape[1], model.num_offsets)
-        super().__init__(model.num_rows, shape, mode)
+        super().__init__(model.num_rows, shape, mode, plugins)
         self._reader = reader
         found = (model.features.data, model.scales.data, model.offsets.data.view(-1, shape.widths[2]))
         self._found = dict(zip(GROUPS, found, strict=True))
@@ -205,7 +215,7 @@ class ExactNetwork:
     def read(self, outputs: Tensor) -> dict[str, RowContext]:
         """Distributions by group that outputs [n, sum(shape.outputs)] stand for."""
         parts = torch.split(outputs, self._shape.outputs, dim=1)
-        multipliers = torch.from_numpy(ConditionalGaussian.step_multipliers(parts[6], self._step_offset))
+        multipliers = torch.from_numpy(step_multipliers(parts[6].numpy()) + self._step_offset)
         return {
             group: RowContext(parts[2 * i], parts[2 * i + 1], multipliers[:, i : i + 1])
             for i, group in enumerate(GROUPS)

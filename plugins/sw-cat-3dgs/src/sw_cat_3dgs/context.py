@@ -23,7 +23,7 @@ from sw_cat_3dgs import spatial_ar
 from sw_cat_3dgs.channel_ar import ChannelAr
 from sw_cat_3dgs.fast import plane_bits, plane_sites, slices
 from sw_cat_3dgs.principal_frame import PrincipalFrame
-from sw_cat_3dgs.spatial_ar import SpatialAr
+from sw_cat_3dgs.spatial_ar import ExactSpatialAr, SpatialAr
 from sw_cat_3dgs.triplane import GAIN, Triplane
 from sw_codecs.context.two_layers import two_layers
 from sw_codecs.quantizers.rounding import add_noise
@@ -48,6 +48,10 @@ class ContextShape(AnchorShape):
     slice_hidden: int
     refine: bool
     base_steps: tuple[float, float, float]
+
+    def planes(self, resolution: int) -> list[tuple[int, int, int]]:
+        """Channels, rows and columns of the planes of each scale, for a base resolution."""
+        return [(self.channels, m * resolution, m * resolution) for m in self.multiples]
 
 
 class CatContext(nn.Module):
@@ -89,6 +93,10 @@ class CatContext(nn.Module):
     def spatial_models(self) -> list[SpatialAr]:
         """The models `arms`, one for each plane orientation."""
         return [arm for arm in self.arms if isinstance(arm, SpatialAr)]
+
+    def exact_arms(self) -> list[ExactSpatialAr]:
+        """The spatial models in integers. Raises BitstreamError for weights that no exact evaluation takes."""
+        return [arm.exact(arm.state()) for arm in self.spatial_models]
 
     # Set-up
 

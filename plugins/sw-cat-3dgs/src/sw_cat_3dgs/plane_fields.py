@@ -14,10 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sw_cat_3dgs.spatial_ar import NEIGHBORS
 from sw_codecs.entropy.exact_tables import FRACTIONS
 
-NEIGHBORS = (*((-2, right) for right in range(-2, 3)), *((-1, right) for right in range(-2, 3)), (0, -2), (0, -1))
-"""(rows down, columns right) of the neighbours, in raster order."""
+Shape = tuple[int, int, int]
+"""Channels, rows and columns of a plane."""
 
 
 class PlaneModel(Protocol):
@@ -33,7 +34,7 @@ class Field:
     """The planes [K, C, H, W] of one scale within a border of zeros, addressed by position r W + c in a plane."""
 
     orientations: int
-    shape: tuple[int, int, int]
+    shape: Shape
 
     def __post_init__(self) -> None:
         self.channels, self.height, self.width = self.shape

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.api import BitstreamError
-from sw_cat_3dgs.plane_fields import Field, PlaneModel, lattice_of, predicted
+from sw_cat_3dgs.plane_fields import Field, PlaneModel, Shape, lattice_of, predicted
 from sw_cat_3dgs.stream_lanes import LaneReader, LaneWriter
 from sw_codecs.bits import checksum
 from sw_codecs.bits.packing import ByteReader, write_varint
@@ -31,7 +31,6 @@ SMALLEST_STREAM = 16_384
 """Integers that a stream has on average, if it could have more: it costs some eight bytes."""
 MOST_SCALES = 4
 """That the kernel takes."""
-Shape = tuple[int, int, int]
 
 
 def encode(planes: Sequence[np.ndarray], models: Sequence[PlaneModel]) -> bytes:

@@ -7,10 +7,15 @@ from typing import TYPE_CHECKING, Any
 from splatwizard_core.api import Registry, hookimpl
 
 if TYPE_CHECKING:
-    from splatwizard_core.api import ContextModel
+    from collections.abc import Callable
+
+    from splatwizard_core.api import ContextModel, EntropyModel
+    from sw_cat_3dgs.plane_coder import PlaneCoder
     from sw_cat_3dgs.spatial_ar import SpatialAr
 
-    _: type[ContextModel] = SpatialAr  # mypy holds it to the contract
+    # mypy holds each class that is registered below to its contract.
+    ENTROPY_MODEL: Callable[..., EntropyModel] = PlaneCoder
+    CONTEXT_MODEL: Callable[..., ContextModel] = SpatialAr
 
 
 @hookimpl
@@ -24,6 +29,13 @@ def register_methods(registry: Registry[Any]) -> None:
 
 
 @hookimpl
+def register_entropy_models(registry: Registry[Any]) -> None:
+    registry.add("wavefront", "sw_cat_3dgs.plane_coder:PlaneCoder",
+                 summary="integer planes, each value from its neighbours in exact integers, along wavefronts",
+                 native="sw_codecs.exact_native:EXACT")  # fmt: skip
+
+
+@hookimpl
 def register_context_models(registry: Registry[Any]) -> None:
     registry.add("spatial-ar", "sw_cat_3dgs.spatial_ar:SpatialAr",
-                 summary="integers of a plane from their causal neighbours, coded along wavefronts")  # fmt: skip
+                 summary="mean and scale of each integer of a plane from twelve causal neighbours")  # fmt: skip

@@ -14,7 +14,7 @@ from sw_anchors.shape import GROUPS
 from torch import Tensor
 
 from sw_cat_3dgs.context import CatContext
-from sw_codecs.entropy.conditional import RowContext
+from sw_codecs.entropy.rows import RowContext
 
 MULTIPLIER_OFFSET = 410
 """Of a step in 1/4096 of its base: round(0.1 * 4096) on top of 4096 (1 + tanh t)."""

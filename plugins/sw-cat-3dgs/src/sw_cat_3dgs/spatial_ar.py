@@ -1,7 +1,7 @@
 """Context model `spatial-ar`: the distribution of each integer of a plane from its causal neighbours.
 
 A residual network of 1,058 weights looks at twelve neighbours and gives mean and scale of a Laplacian. In training it
-runs over whole planes at once; a decoder goes along wavefronts (`wavefront`), with the network in exact integers.
+runs over whole planes at once; a decoder goes along wavefronts (`plane_coder`), with the network in exact integers.
 Source: CAT-3DGS (arXiv 2503.00357), after Cool-Chic (arXiv 2212.05458).
 """
 
@@ -15,13 +15,13 @@ import torch
 from torch import Tensor, nn
 
 from splatwizard_core.api import BitstreamError
-from sw_cat_3dgs import wavefront
-from sw_cat_3dgs.plane_fields import NEIGHBORS
 from sw_codecs.context.integer_mlp import FRACTION, IntegerMlp
 from sw_codecs.context.two_layers import UnsetLinear
 from sw_codecs.entropy.exact_tables import LEVELS
 from sw_codecs.entropy.rates import laplace_bits, lower_bound
 
+NEIGHBORS = (*((-2, right) for right in range(-2, 3)), *((-1, right) for right in range(-2, 3)), (0, -2), (0, -1))
+"""(rows down, columns right) of the neighbours, in raster order."""
 HIDDEN = 16
 RESIDUALS = 3
 SMALLEST, LARGEST = 0.05, 64.0
@@ -88,23 +88,6 @@ class SpatialAr(nn.Module):
     def exact(state: Mapping[str, np.ndarray]) -> ExactSpatialAr:
         """The integer form of what `state` gave. Raises BitstreamError if the arrays make no such network."""
         return ExactSpatialAr(state)
-
-    @staticmethod
-    def encode(planes: Sequence[np.ndarray], networks: Sequence[ExactSpatialAr]) -> bytes:
-        """Bytes of integer planes [K, C, H, W] per scale, orientation k under networks[k] (`wavefront.encode`)."""
-        return wavefront.encode(planes, networks)
-
-    @staticmethod
-    def decode(
-        data: bytes, shapes: Sequence[tuple[int, int, int]], networks: Sequence[ExactSpatialAr]
-    ) -> list[np.ndarray]:
-        """Inverse of `encode`: shapes are (C, H, W) per scale (`wavefront.decode`)."""
-        return wavefront.decode(data, shapes, networks)
-
-    @staticmethod
-    def table_bits(planes: Sequence[np.ndarray], networks: Sequence[ExactSpatialAr]) -> float:
-        """Bits that `encode` spends on the integers, from the very tables it uses."""
-        return wavefront.table_bits(planes, networks)
 
 
 def plane_bits(networks: Sequence[SpatialAr], planes: Sequence[Tensor]) -> Tensor:

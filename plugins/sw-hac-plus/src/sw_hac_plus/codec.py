@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from sw_anchors.shape import AnchorShape
     from torch import nn
 
-    from splatwizard_core.api import ContainerReader, ContainerWriter
+    from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager
     from sw_hac.config import FileSettings
     from sw_hac.mixed_grid import MixedHashGrid
     from sw_hac_plus.model import HACPlusAnchors
@@ -38,31 +38,31 @@ AFTER_FEATURES = {"scales": "scalings", "offsets": "offsets"}
 """Group -> section, of what one Gaussian predicts."""
 
 
-def encode(model: HACPlusAnchors, writer: ContainerWriter, settings: FileSettings) -> None:
+def encode(model: HACPlusAnchors, writer: ContainerWriter, settings: FileSettings, plugins: PluginManager) -> None:
     """Write all sections; the model stays as it is."""
     model = hac_sections.settled_copy(model, settings.weights)
     geometry, rows = kept_voxels(model)
     hac_sections.add_header(model, writer, settings.mode)
     _add_channel(writer, model.channel)
-    add_voxels(writer, geometry)
-    hac_sections.add_grid(writer, model.grid)
+    add_voxels(writer, geometry, plugins)
+    hac_sections.add_grid(writer, model.grid, plugins)
     add_networks(writer, model.networks(), settings.weights)
 
     writer.require("context model", "integer-mlp")
-    attributes = AttributeEncoder(model, rows, sections(model.channel), settings.mode)
+    attributes = AttributeEncoder(model, rows, sections(model.channel), settings.mode, plugins)
     walk = Walk(settings.mode, model.grid, model.mlp_grid, model.channel, model.shape, model.base_steps)
     walk(attributes, geometry)
     attributes.write(writer)
     writer.allow(len(rows) * model.shape.decoded_bytes, f"a model of {len(rows):,} anchors")
 
 
-def decode(reader: ContainerReader) -> DecodedAnchors:
+def decode(reader: ContainerReader, plugins: PluginManager) -> DecodedAnchors:
     """Raises BitstreamError for damage, and for a file of mode `float` that another machine wrote."""
     header = hac_sections.read_header(reader)
     shape = header.shape
     channel = _read_channel(reader, shape.features)
-    geometry = read_voxels(reader, bytes_per_anchor=shape.decoded_bytes)
-    grid = hac_sections.read_grid(reader, header.grid_features)
+    geometry = read_voxels(reader, plugins, bytes_per_anchor=shape.decoded_bytes)
+    grid = hac_sections.read_grid(reader, header.grid_features, plugins)
     model = DecodedAnchors.zeros(geometry, shape, hidden=header.hidden)
     outputs = sum(shape.outputs) + (0 if channel is None else shape.features)
     mlp_grid = two_layers(grid.width, header.grid_hidden, outputs, torch.Generator())
@@ -70,7 +70,7 @@ def decode(reader: ContainerReader) -> DecodedAnchors:
     read_networks(reader, networks | {"mlp_grid": mlp_grid} | ({} if channel is None else {"channel": channel}))
     with reader.decoding("networks"):
         walk = Walk(header.mode, grid, mlp_grid, channel, shape, header.base_steps)
-    attributes = AttributeDecoder(reader, model, sections(channel), header.mode)
+    attributes = AttributeDecoder(reader, model, sections(channel), header.mode, plugins)
     walk(attributes, geometry)
     attributes.finish()
     return model

@@ -72,8 +72,8 @@ class HACPlus(Method):
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         if not isinstance(model, HACPlusAnchors):
             raise TypeError(f"hac-plus encodes its own anchors, not a {type(model).__name__}")
-        codec.encode(model, writer, self.config.codec.settings)
+        codec.encode(model, writer, self.config.codec.settings, self.plugins)
 
     def decode(self, reader: ContainerReader) -> SplatModel:
         self.check_version(reader)
-        return codec.decode(reader)
+        return codec.decode(reader, self.plugins)

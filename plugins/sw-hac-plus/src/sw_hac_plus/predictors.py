@@ -16,8 +16,7 @@ from sw_anchors.row_parts import EXACT_NUMBERS, FLOAT_NUMBERS, by_parts
 from sw_anchors.shape import GROUPS, AnchorShape
 from torch import Tensor, nn
 
-from sw_codecs.entropy.conditional import RowContext
-from sw_codecs.entropy.conditional_mixture import RowMixture
+from sw_codecs.entropy.rows import RowContext, RowMixture
 from sw_hac.mixed_grid import MixedHashGrid
 from sw_hac.model import context_of
 from sw_hac.predictors import BlockPrediction, row_width, short_features

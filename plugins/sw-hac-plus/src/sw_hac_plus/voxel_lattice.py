@@ -28,12 +28,11 @@ from sw_anchors.sections import (
 from torch import Tensor
 
 from splatwizard_core.api import BitstreamError
-from sw_codecs.positions.octree import Octree
 
 if TYPE_CHECKING:
     from sw_anchors.coded_anchors import CodedAnchors
 
-    from splatwizard_core.api import ContainerReader, ContainerWriter
+    from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager
 
 MOST_BITS = 21
 """Of an axis of the octree."""
@@ -115,18 +114,18 @@ def kept_voxels(model: CodedAnchors) -> tuple[VoxelGeometry, Tensor]:
     return VoxelGeometry(bounds, codes, masks, integers, model.voxel_size), rows
 
 
-def add_voxels(writer: ContainerWriter, geometry: VoxelGeometry) -> None:
+def add_voxels(writer: ContainerWriter, geometry: VoxelGeometry, plugins: PluginManager) -> None:
     """Add the sections `anchors` and `masks`, and the header values num_anchors, num_gaussians and num_offsets."""
-    writer.require("coder", "octree")
     integers, n = geometry.integers.numpy(), len(geometry.integers)
     low = integers.min(axis=0) if n else np.zeros(3, np.int64)
     reach = int((integers - low).max(initial=0))
     head = geometry.bounds.numpy().astype("<f4").tobytes() + _HEAD.pack(geometry.voxel_size, *map(int, low))
-    writer.add("anchors", head + Octree().encode(integers - low, max(1, reach.bit_length())))
-    add_masks(writer, geometry.masks)
+    octree = plugins.position_codecs.load("octree")()
+    writer.add("anchors", head + octree.encode(integers - low, max(1, reach.bit_length())))
+    add_masks(writer, geometry.masks, plugins)
 
 
-def read_voxels(reader: ContainerReader, *, bytes_per_anchor: int) -> VoxelGeometry:
+def read_voxels(reader: ContainerReader, plugins: PluginManager, *, bytes_per_anchor: int) -> VoxelGeometry:
     """Inverse of `add_voxels`.
 
     bytes_per_anchor    of the decoded model, held against the size of the file before anything is allocated
@@ -142,7 +141,7 @@ def read_voxels(reader: ContainerReader, *, bytes_per_anchor: int) -> VoxelGeome
         voxel_size, *low = _HEAD.unpack(head)
         if not math.isfinite(voxel_size) or not 1e-30 < voxel_size < 1e30:
             raise BitstreamError("the voxel size is no positive number")
-        points = Octree(max_points=n).decode(data[BOUNDS_BYTES + _HEAD.size :])
+        points = plugins.position_codecs.load("octree")(max_points=n).decode(data[BOUNDS_BYTES + _HEAD.size :])
         if points.shape != (n, 3):
             raise BitstreamError(f"holds {len(points):,} anchors, header says {n:,}")
         integers = torch.from_numpy(points) + torch.tensor(low, dtype=torch.int64)
@@ -152,5 +151,5 @@ def read_voxels(reader: ContainerReader, *, bytes_per_anchor: int) -> VoxelGeome
         if not bool(torch.isfinite(positions).all()):
             raise BitstreamError("the voxel size puts an anchor beyond all finite positions")
         codes = position_codes(positions, bounds)
-    masks = read_masks(reader, n, k, gaussians)
+    masks = read_masks(reader, plugins, n, k, gaussians)
     return VoxelGeometry(bounds, codes, masks, integers, voxel_size)

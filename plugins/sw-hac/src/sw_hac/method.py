@@ -42,8 +42,8 @@ class HAC(Method):
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         if not isinstance(model, HACAnchors):
             raise TypeError(f"hac encodes its own anchors, not a {type(model).__name__}")
-        codec.encode(model, writer, self.config.codec.settings)
+        codec.encode(model, writer, self.config.codec.settings, self.plugins)
 
     def decode(self, reader: ContainerReader) -> SplatModel:
         self.check_version(reader)
-        return codec.decode(reader)
+        return codec.decode(reader, self.plugins)

@@ -12,8 +12,7 @@ from sw_anchors.row_parts import FLOAT_NUMBERS, by_parts
 from sw_anchors.shape import GROUPS, AnchorShape
 from torch import Tensor, nn
 
-from sw_codecs.entropy.conditional import RowContext
-from sw_codecs.entropy.lattice import RowLattice
+from sw_codecs.entropy.rows import RowContext, RowLattice
 from sw_hac.mixed_grid import MixedHashGrid
 from sw_hac.model import context_of
 

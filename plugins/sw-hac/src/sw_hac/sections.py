@@ -21,12 +21,11 @@ from sw_anchors.shape import AnchorShape
 from torch import Tensor
 
 from sw_codecs.context.hash_grid import HashGrid
-from sw_codecs.entropy.bernoulli import Bernoulli
 from sw_hac.mixed_grid import MixedHashGrid
 from sw_hac.model import HACAnchors
 
 if TYPE_CHECKING:
-    from splatwizard_core.api import ContainerReader, ContainerWriter
+    from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager
     from sw_hac.predictors import BlockPrediction
 
 log = logging.getLogger(__name__)
@@ -93,13 +92,12 @@ def read_header(reader: ContainerReader) -> HACHeader:
     return HACHeader(mode, base_steps, shape, hidden, grid_hidden, grid_features)
 
 
-def add_grid(writer: ContainerWriter, grid: MixedHashGrid) -> None:
+def add_grid(writer: ContainerWriter, grid: MixedHashGrid, plugins: PluginManager) -> None:
     """Add the section `grids`."""
-    writer.require("entropy model", "bernoulli")
-    writer.add("grids", Bernoulli().encode(grid.signs().numpy()))
+    writer.add("grids", plugins.entropy_models.load("bernoulli")().encode(grid.signs().numpy(), None))
 
 
-def read_grid(reader: ContainerReader, features: int) -> MixedHashGrid:
+def read_grid(reader: ContainerReader, features: int, plugins: PluginManager) -> MixedHashGrid:
     """The hash grid with the signs of the file. Raises BitstreamError."""
     space, planes = (read_integers(reader, key, low=3, high=4096, longest=32) for key in ("grid_space", "grid_planes"))
     log2_space, log2_planes = read_integers(reader, "grid_log2", low=3, high=22, shortest=2, longest=2)
@@ -107,7 +105,7 @@ def read_grid(reader: ContainerReader, features: int) -> MixedHashGrid:
     reader.allow(4 * entries, f"a hash grid of {entries:,} signs")
     grid = MixedHashGrid(space, planes, features=features, log2_space=log2_space, log2_planes=log2_planes)
     with reader.decoding("grids") as data:
-        grid.load_signs(Bernoulli().decode(data, entries))
+        grid.load_signs(plugins.entropy_models.load("bernoulli")().decode(data, entries))
     return grid
 
 

@@ -12,8 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from splatwizard_native import fast_enabled
 from sw_cat_3dgs.fast import plane_kernels
-from sw_cat_3dgs.plane_fields import NEIGHBORS
-from sw_cat_3dgs.spatial_ar import HIDDEN, LARGEST, P_MIN, RESIDUALS, SMALLEST, SpatialAr
+from sw_cat_3dgs.spatial_ar import HIDDEN, LARGEST, NEIGHBORS, P_MIN, RESIDUALS, SMALLEST, SpatialAr
 
 _S_RANGE = -2 * math.log(LARGEST), -2 * math.log(SMALLEST)
 _WINDOW = (3, 5)
