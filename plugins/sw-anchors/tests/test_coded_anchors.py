@@ -161,7 +161,7 @@ def test_the_rate_of_a_whole_sample_is_that_of_all_kept_anchors():
     assert rate.numbers == 40 * (5 + 6 + 12)
     masks, values = model.masks(rows), tuple(v.detach() for v in model.raw(rows))
     kept = masks.detach().amax(dim=1)
-    forecast = model.rate_model.forecast(model.context(rows), rows)
+    forecast = model.rate_model.forecast(model.context_of(rows), rows)
     bits_of_all, by_group = model.rate_model.rate(torch.cat(values, dim=1), forecast, masks, kept)
     normal = torch.distributions.Normal(0.0, 1.0)
     probability = normal.cdf(values[2] + 0.1) - normal.cdf(values[2] - 0.1)
@@ -177,7 +177,7 @@ def test_deviations_below_zero_learn_if_there_is_a_floor(floor):
     model = make(n=20, scale_floor=floor)
     raw = model.deviations = torch.full((20, 5), -0.5, requires_grad=True)
     rows = torch.arange(20)
-    forecast = model.rate_model.forecast(model.context(rows), rows)
+    forecast = model.rate_model.forecast(model.context_of(rows), rows)
     values = torch.cat([torch.full((20, 5), 0.55), *(v.detach() for v in model.raw(rows)[1:])], dim=1)
     bits, by_group = model.rate_model.rate(values, forecast, model.masks(rows), torch.ones(20))
     bits.backward()
@@ -194,7 +194,7 @@ def test_an_empty_sample_costs_nothing(kind):
     model.phase, model.sample = ENTROPY, 0.0
     rate = model.attributes(torch.arange(8)).extras["rate"]
     assert (float(rate.bits.detach()), rate.numbers) == (0.0, 0)
-    assert float(model.attributes(torch.arange(0)).extras["rate"].bits) == 0.0
+    assert float(model.attributes(torch.arange(0)).extras["rate"].bits.detach()) == 0.0
 
 
 def test_the_rate_may_be_that_of_a_sample_of_all_anchors():

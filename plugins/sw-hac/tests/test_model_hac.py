@@ -152,9 +152,9 @@ def test_what_training_forecasts_for_a_sample_is_what_is_predicted(in_steps, ker
     model = make(in_steps=in_steps)
     rows, drawn = torch.tensor([7, 3, 250, 20]), torch.tensor([3, 1])
     parameters = [*model.mlp_grid.parameters(), *model.grid.parameters()]
-    context, forecast = predicted(model, rows), model.rate_model.forecast(model.context(rows), drawn)
+    context, forecast = predicted(model, rows), model.rate_model.forecast(model.context_of(rows), drawn)
     sampled = model.rate_model.read(forecast.outputs)
-    own_bits = model.grid.with_bits(*model.context(rows))[1]
+    own_bits = model.grid.with_bits(*model.context_of(rows))[1]
     steps = torch.cat(context.steps, dim=1)
     expected = [torch.cat(parts, dim=1)[drawn] for parts in (context.means, context.scales)]
     expected = [steps, steps[drawn], *expected, own_bits]

@@ -170,7 +170,7 @@ class CodedAnchors(AnchorModel):
         """What the rate model predicts from, for all anchors."""
         raise NotImplementedError
 
-    def context(self, rows: Tensor) -> Context:
+    def context_of(self, rows: Tensor) -> Context:
         """The same of the anchors `rows`."""
         return tuple(part.index_select(0, rows) for part in self.context_rows())
 
@@ -203,7 +203,7 @@ class CodedAnchors(AnchorModel):
         numbers do.
         """
         uniform, drawn = self._draw_noise(rows), self.draw_sample(len(rows))
-        forecast = self.rate_model.forecast(self.context(rows), drawn)
+        forecast = self.rate_model.forecast(self.context_of(rows), drawn)
         values = self._values(rows, Noise(forecast.steps, uniform), drawn)
         kept = values.masks.detach().amax(dim=1)
         counted, masks = kept.index_select(0, drawn), values.masks.index_select(0, drawn)
@@ -215,7 +215,7 @@ class CodedAnchors(AnchorModel):
         """Noisy values of the anchors `rows`, and the rate of a sample of all anchors under noise of its own."""
         drawn = self.draw_sample(self.num_rows)
         sample = slice(len(rows), None)
-        forecast = self.rate_model.forecast(self.context(torch.cat([rows, drawn])), sample)
+        forecast = self.rate_model.forecast(self.context_of(torch.cat([rows, drawn])), sample)
         values = self._values(rows, Noise(forecast.steps[: len(rows)], self._draw_noise(rows)))
         every = torch.arange(len(drawn), device=self.device)
         own = self._values(drawn, Noise(forecast.sample_steps, self._draw_noise(drawn)), every)
@@ -245,7 +245,7 @@ class CodedAnchors(AnchorModel):
         """Rounded attributes: what the file holds."""
         steps = self.base_steps_like(self.features)[None]
         if self.phase == ENTROPY:
-            steps = self.rate_model.forecast(self.context(rows), rows[:0]).steps
+            steps = self.rate_model.forecast(self.context_of(rows), rows[:0]).steps
         groups = zip(self.raw(rows), steps.split(1, dim=1), self.centres(), strict=True)
         features, scales, offsets = (self._round.forward(v, step, mean=centre) for v, step, centre in groups)
         offsets = offsets.reshape(-1, self.num_offsets, 3)

@@ -15,7 +15,7 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from splatwizard_core.api import Camera, GaussianInputs, Rasterizer
@@ -174,7 +174,10 @@ class FixedDecoder:
         return inputs_of(model, at, rows, (results, others))
 
     def _prepared(self, model: Model, parts: tuple[Tensor, ...], capacity: int, places: int) -> _Prepared:
-        key = (*_plain_values(model), *_plain_values(model.rate_model), *(part.shape[1:] for part in parts))
+        rate_model = model.rate_model if model.phase == ENTROPY else None
+        parts_of_it = [] if rate_model is None else [rate_model, *vars(rate_model).values()]
+        deciding = [model, *(each for each in parts_of_it if each is rate_model or isinstance(each, nn.Module))]
+        key = (*(_plain_values(each) for each in deciding), *(part.shape[1:] for part in parts))
         room = capacity <= self._rows_held("positions") and places <= self._rows_held("pool counted")
         if key != self._key or not self._watched.unchanged() or not room:
             self._drop()
@@ -250,12 +253,14 @@ DECODERS: WeakKeyDictionary[Any, FixedDecoder] = WeakKeyDictionary()
 
 def _plain_values(holder: object) -> list[Any]:
     """Values of an object that decide which operators run: its numbers and words."""
-    plain = (bool, int, float, str, tuple)
-    return [(name, value) for name, value in vars(holder).items() if type(value) in plain and _is_plain(value)]
+    return [(name, value) for name, value in vars(holder).items() if _is_plain(value)]
 
 
 def _is_plain(value: Any) -> bool:
-    return type(value) is not tuple or all(type(each) in (int, float) for each in value)
+    return type(value) in _PLAIN or (type(value) is tuple and all(type(each) in _PLAIN for each in value))
+
+
+_PLAIN = (bool, int, float, str)
 
 
 class _Decoded(torch.autograd.Function):
