@@ -81,7 +81,7 @@ class Recorder(AttributeEncoder):
         symbols = super().code(block, context, step, present)
         self.found[block.group].append((symbols * step).to(torch.float32))
         mixed = isinstance(context, RowMixture)
-        coder = self.mixtures if mixed else self.coder
+        coder = self.further.get(type(context), self.coder)
         self.mixed += [(symbols, context)] if mixed else []
         self.bits += float(coder.bits(symbols, context, present).sum())
         return symbols
@@ -93,9 +93,10 @@ def recorded(model, mode="exact"):
     model.fold_units()
     round_networks(model.networks(), "float32")
     geometry, rows = kept_voxels(model)
-    recorder = Recorder(model, rows, codec.sections(model.channel), mode, PLUGINS)
+    further = codec.mixtures(model.channel, mode, PLUGINS)
+    recorder = Recorder(model, rows, codec.sections(model.channel), mode, PLUGINS, further)
     with torch.no_grad():
-        codec.Walk(mode, model.grid, model.mlp_grid, model.channel, model.shape, model.base_steps)(recorder, geometry)
+        codec.walk(recorder, model.rate_model.predictor(mode), model.channel, geometry)
     return recorder, geometry
 
 

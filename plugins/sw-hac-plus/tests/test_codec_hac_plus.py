@@ -19,7 +19,7 @@ from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import BitstreamError, SceneError
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene
-from sw_hac_plus import codec, predictors
+from sw_hac_plus import codec, rate_model
 from sw_hac_plus.method import HACPlus
 from sw_hac_plus.voxel_lattice import kept_voxels
 
@@ -101,7 +101,7 @@ def test_channel_networks_are_evaluated_a_few_rows_at_a_time(mode, limit, monkey
         return plain(self, index, known, context)
 
     monkeypatch.setattr(type(channel), "slice", counted)
-    monkeypatch.setattr(predictors, limit, 600)
+    monkeypatch.setattr(rate_model, limit, 600)
     found, _ = recorded(model, mode)
     assert len(seen) > len(FEATURES)
     assert max(seen) <= 600

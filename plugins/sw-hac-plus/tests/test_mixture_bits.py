@@ -2,10 +2,11 @@
 
 import pytest
 import torch
-from sw_anchors.fast.mixture_bits import MaskKind, Predicted, fit_mixture_kernel, mixture_bits
+from sw_anchors.fast import sample_bits
 from sw_anchors.native import ANCHORS
 
 from sw_codecs.entropy import rates
+from sw_hac.fast.predicted_bits import MaskKind, Predicted, mixture_bits
 from sw_hac_plus.channel_mixture import ChannelMixture
 from sw_hac_plus.fast.channel_networks import ChannelNetworks
 
@@ -98,7 +99,7 @@ def both(kind, slices, k, count, *, device="cpu", masks=MaskKind.GATED_MEAN, flo
         if channel is not None:
             channel = channel.to(device, dtype)
             networks, parameters = ChannelNetworks(channel, units.device), ChannelNetworks.parameters(channel)
-        assert fit_mixture_kernel(*leaves, counted, *parameters) == (dtype == torch.float32)
+        assert sample_bits.fits(*leaves, counted, *parameters) == (dtype == torch.float32)
         if dtype == torch.float32:
             bits, by_group = mixture_bits(*leaves, counted, predicted, networks, tuple(parameters))
         else:

@@ -17,7 +17,6 @@ from sw_hac.config import HACConfig
 from sw_hac.method import HAC
 from sw_hac.mixed_grid import MixedHashGrid
 from sw_hac.model import HACAnchors
-from sw_hac.predictors import PREDICTORS
 
 PLUGINS = load_plugins()
 SMALL_GRID = {"features": 2, "log2_space": 8, "log2_planes": 8}
@@ -53,7 +52,7 @@ def make(n: int = 300, feature_dim: int = 8, k: int = 4, *, seed: int = 0, **kwa
         last.weight[-3:] *= 2
         last.weight[2 * feature_dim : 2 * feature_dim + 12] *= 0.02
         if n:
-            context = model.predict(torch.arange(n))
+            context = predicted(model, torch.arange(n))
             features, scales, offsets = (
                 mean + scale.clamp(min=1e-9) * torch.randn(mean.shape, generator=g)
                 for mean, scale in zip(context.means, context.scales, strict=True)
@@ -65,6 +64,11 @@ def make(n: int = 300, feature_dim: int = 8, k: int = 4, *, seed: int = 0, **kwa
             model.mask_logits[:5] = -6
     model.phase = ENTROPY
     return model.eval()
+
+
+def predicted(model, rows):
+    """Distributions of the anchors `rows`."""
+    return model.rate_model.predict(*model.context_of(rows))
 
 
 def encoded(model: HACAnchors, **values) -> bytes:
@@ -95,7 +99,7 @@ class Recorder(AttributeEncoder):
 
 
 def predictor(model, mode="exact"):
-    return PREDICTORS[mode](model.grid, model.mlp_grid, model.shape, model.base_steps)
+    return model.rate_model.predictor(mode)
 
 
 def lattice_of(model, *, mode="exact", **values):

@@ -1,5 +1,6 @@
 """The file of HAC: exact integers on any machine, counted in full, and safe against strangers."""
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -31,7 +32,6 @@ from sw_codecs.entropy.lattice import lattice
 from sw_codecs.entropy.rows import RowContext, RowLattice
 from sw_hac import codec
 from sw_hac.method import HAC
-from sw_hac.predictors import PREDICTORS
 
 RASTERIZER = ReferenceRasterizer()
 SECTIONS = ["anchors", "masks", "grids", "networks", "features", "scalings", "offsets"]
@@ -411,10 +411,10 @@ def test_a_wide_grid_is_looked_up_a_few_anchors_at_a_time(mode, monkeypatch):
     limit = 20 * grid.corners
     for where, name in (
         ("sw_anchors.attribute_sections", "EXACT_NUMBERS"),
-        ("sw_hac.predictors", "FLOAT_NUMBERS"),
+        ("sw_hac.rate_model", "FLOAT_NUMBERS"),
     ):
         monkeypatch.setattr(f"{where}.{name}", limit)
-    found = PREDICTORS[mode](grid, model.mlp_grid, model.shape, model.base_steps)(model.codes())
+    found = dataclasses.replace(model.rate_model, grid=grid).predictor(mode)(model.codes())
     assert 0 < max(grid.numbers) <= limit
     for group in GROUPS:
         for field in ("centre", "number", "step") if mode == "exact" else ("mean", "scale", "step"):

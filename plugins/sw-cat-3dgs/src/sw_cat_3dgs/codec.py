@@ -15,8 +15,8 @@ import torch
 from sw_anchors.attribute_sections import AttributeCoder, AttributeDecoder, AttributeEncoder, Block
 from sw_anchors.decoded_anchors import DecodedAnchors
 from sw_anchors.float_mode import add_machine, one_thread, read_mode
-from sw_anchors.forecasts import triple
 from sw_anchors.header import read_base_steps, read_integers
+from sw_anchors.rate_model import triple
 from sw_anchors.sections import (
     AnchorGeometry,
     add_geometry,

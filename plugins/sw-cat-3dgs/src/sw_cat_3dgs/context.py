@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from sw_anchors.anchors import linear_layers
-from sw_anchors.forecasts import AnchorContext, Triple, triple
 from sw_anchors.lattice import low_and_step
+from sw_anchors.rate_model import AnchorContext, Triple, triple
 from sw_anchors.shape import AnchorShape
 from torch import Tensor, nn
 

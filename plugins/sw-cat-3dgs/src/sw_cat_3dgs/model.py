@@ -7,14 +7,14 @@ from typing import Any, Literal
 
 import torch
 from sw_anchors.coded_anchors import CodedAnchors
-from sw_anchors.forecasts import AnchorContext, AnchorForecast
+from sw_anchors.rate_model import AnchorContext, Context
 from torch import Tensor
 
 from splatwizard_core.api import Camera, Rasterizer
 from sw_cat_3dgs.context import STEP_OFFSET, CatContext
 from sw_cat_3dgs.fast import plane_sites
-from sw_cat_3dgs.fast.forecast import forecast
 from sw_cat_3dgs.fast.plane_graphs import FixedPlaneBits
+from sw_cat_3dgs.rate_model import CatRateModel
 
 Trained = Literal["everything", "spatial models", "all but planes", "nothing"]
 
@@ -47,7 +47,7 @@ class CatAnchors(CodedAnchors):
 
     def __getstate__(self) -> dict[str, Any]:
         """A copy works out anew where its anchors lie."""
-        return {**super().__getstate__(), "_places": None, "_sites": None, "fixed_planes": None}
+        return {**self.__dict__, "_places": None, "_sites": None, "fixed_planes": None}
 
     def mask_weights(self) -> Tensor:
         return self.view_weights[:, None]
@@ -74,23 +74,20 @@ class CatAnchors(CodedAnchors):
         found: AnchorContext = self.context(self.places()[rows])
         return found
 
-    def context_rows(self) -> tuple[Tensor, ...] | None:
-        """The sites of the anchors on the planes, where `fast` takes these."""
+    def context_rows(self) -> Context:
+        """The places of the anchors in the triplane; their sites on the planes, where `fast` takes these."""
         planes = list(self.context.triplane.planes)
         if not plane_sites.fits(planes):
-            return None
+            return (self.places(),)
         places = self.places()
         if self._sites is None or self._sites[0] is not places or self._sites[1] != self.context.resolution:
             self._sites = None  # the old ones go before the new ones come
             self._sites = places, self.context.resolution, plane_sites.sites_of(planes, places)
         return self._sites[2]
 
-    def forecast_at(self, parts: tuple[Tensor, ...]) -> AnchorForecast:
-        sites = plane_sites.PlaneSites(*parts)
-        return forecast(self.context, sites, self.base_steps_like(sites.weights))
-
-    def step_key(self) -> tuple[Any, ...]:
-        return *super().step_key(), self.context.rounded, self.context.in_steps
+    @property
+    def rate_model(self) -> CatRateModel:
+        return CatRateModel(self.context, self.base_steps_like(self.features), self.floors)
 
     def plane_bits(self, share: float) -> Tensor:
         """Estimate the bits of the planes from a share of their channels; differentiable."""

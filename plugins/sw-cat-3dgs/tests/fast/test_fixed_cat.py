@@ -5,7 +5,7 @@ from contextlib import nullcontext
 
 import pytest
 import torch
-from sw_anchors.testing import check_fixed_decoder
+from sw_anchors.testing import check_plain, check_replayed
 
 from sw_cat_3dgs.fast.plane_graphs import FixedPlaneBits
 
@@ -32,7 +32,8 @@ def test_fixed_sizes_change_neither_values_nor_gradients(model, little_scene, ro
     model.scale_floor = 0.05 if rounded else 0.0
     model.train_only("all but planes" if rounded else "everything")
     camera = little_scene.train[0].camera
-    check_fixed_decoder(lambda: copy.deepcopy(model), camera, counts=(0, 40))
+    check_replayed(lambda: copy.deepcopy(model), camera, counts=(0, 40))
+    check_plain(lambda: copy.deepcopy(model), camera, counts=(0, 40))
 
 
 def plane_bits(model, fixed, share, seed=0):
@@ -100,7 +101,7 @@ def test_graphs_change_neither_values_nor_gradients(model, little_scene):
     for rounded in (False, True):
         model.context.rounded = rounded
         model.train_only("all but planes" if rounded else "everything")
-        check_fixed_decoder(lambda: copy.deepcopy(model), camera, counts=(0, 40, 20), graphs=True)
+        check_replayed(lambda: copy.deepcopy(model), camera, counts=(0, 40, 20), graphs=True)
 
 
 @pytest.mark.cuda

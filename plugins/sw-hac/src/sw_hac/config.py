@@ -13,6 +13,10 @@ from splatwizard_core.api import Params
 Resolution = Annotated[int, Field(ge=3, le=4096)]
 
 
+SMALLEST_STEP = 1 / 64
+"""Smallest step over its base. The published 1 + tanh t can underflow to 0; the coder's table of steps ends here."""
+
+
 class GridSettings(Params):
     """The hash grid and the network that reads it."""
 

@@ -1,46 +1,39 @@
-"""Anchors, a binary hash grid over their positions, and a network that predicts distributions: the model of HAC.
+"""The model of HAC: coded anchors, and the grid and network of their rate model.
 
-For an anchor at u in [0,1]^3 the network gives mean and deviation of its F features, 6 scales and 3k coordinates of
-offsets, and one number t a group, whose quantiser step is Q0 (1 + tanh t); Q0 = 1, 0.001 and 0.2 as published.
 Source: HAC (arXiv 2403.14530), section 4.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
 from sw_anchors.anchors import linear_layers
 from sw_anchors.coded_anchors import CodedAnchors
-from sw_anchors.fast.predicted_steps import predicted_steps
-from sw_anchors.forecasts import AnchorContext, AnchorForecast
 from sw_anchors.lattice import TOP
-from sw_anchors.shape import AnchorShape
+from sw_anchors.rate_model import Context
 from torch import Tensor, nn
 
 from splatwizard_core.api import SceneError
 from sw_codecs.context.two_layers import two_layers
 from sw_hac.mixed_grid import MixedHashGrid
+from sw_hac.rate_model import HACRateModel
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Scene
     from sw_hac.config import HACParams
 
-SMALLEST_STEP = 1 / 64
-"""Of the base step. The published 1 + tanh t can underflow to 0, and the coder's table of steps ends here."""
-
 
 class HACAnchors(CodedAnchors):
-    """CodedAnchors with the grid and its network.
+    """CodedAnchors whose attributes a hash grid and a network predict.
 
     grid        hash grid over the box of the anchors, signs
     mlp_grid    from its features to the outputs of `AnchorShape`
+    units       [W] buffer: factors of these outputs
     """
 
     grid: MixedHashGrid
     mlp_grid: nn.Sequential
-
     units: Tensor
 
     def __init__(
@@ -63,7 +56,7 @@ class HACAnchors(CodedAnchors):
         super().__init__(*tensors, generator=generator, **kwargs)
         widths = [*self.shape.outputs, further]
         self.grid = grid.to(self.features)
-        self._places: tuple[Tensor, tuple[Tensor, ...]] | None = None
+        self._places: tuple[Tensor, Tensor] | None = None
         self.mlp_grid = two_layers(grid.width, grid_hidden, sum(widths), generator).to(self.features)
         units = [step if in_steps else 1.0 for step in self.base_steps for _ in range(2)] + [1.0, 1.0]
         self.register_buffer("units", torch.tensor(units).repeat_interleave(torch.tensor(widths)).to(self.features))
@@ -94,49 +87,23 @@ class HACAnchors(CodedAnchors):
 
     def __getstate__(self) -> dict[str, Any]:
         """A copy works out anew where its anchors lie."""
-        return {**super().__getstate__(), "_places": None}
+        return {**self.__dict__, "_places": None}
 
     def networks(self) -> dict[str, nn.Module]:
         """Networks that the file holds, in its order."""
         return {name: getattr(self, name) for name in (*self.NETWORKS, "mlp_grid")}
 
-    def context_rows(self) -> tuple[Tensor, ...]:
-        """Positions of the anchors in the grid's cube."""
+    def context_rows(self) -> Context:
+        """Places of the anchors in the cube of the grid, [N,3] in 0..1."""
         codes = self.codes()
         if self._places is None or self._places[0] is not codes:
-            self._places = (codes, (codes.to(self.features) / TOP,))
-        return self._places[1]
+            self._places = codes, codes.to(self.features) / TOP
+        return (self._places[1],)
 
-    def _looked_up(self, parts: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-        """Look up features of the grid at rows of `context_rows`; and the bits of its signs."""
-        return self.grid.with_bits(*parts)
-
-    def forecast_at(self, parts: tuple[Tensor, ...]) -> AnchorForecast:
-        features, bits = self._looked_up(parts)
-        first, last = linear_layers(self.mlp_grid)
-        # All anchors have noise of their own steps; the rest of the last layer is for the sample.
-        widths = self.shape.outputs[:6]
-        count = sum(widths)
-        sizes = [count, 3, len(last.bias) - count - 3]
-        weights, biases = torch.split(last.weight, sizes), torch.split(last.bias, sizes)
-        parameters = (first.weight, first.bias, weights[1], biases[1])
-        base = self.base_steps_like(features)
-        steps, hidden = predicted_steps(features, parameters, base, offset=1.0, smallest=SMALLEST_STEP)
-
-        def outputs(hidden: Tensor) -> Tensor:
-            return torch.nn.functional.linear(hidden, weights[0], biases[0])
-
-        def sample(drawn: Tensor, hidden: Tensor | None, values: Tensor) -> tuple[Tensor, Tensor]:
-            assert hidden is not None
-            parts = torch.split(outputs(hidden) * self.units[:count], widths, dim=1)
-            return torch.cat(parts[0::2], dim=1), torch.cat(parts[1::2], dim=1)
-
-        return AnchorForecast(steps, bits, hidden, sample, outputs, self.units[:count])
-
-    def predict(self, rows: Tensor) -> AnchorContext:
-        features, bits = self._looked_up(tuple(part.index_select(0, rows) for part in self.context_rows()))
-        outputs = (self.mlp_grid(features) * self.units)[:, : sum(self.shape.outputs)]
-        return context_of(outputs, self.shape, self.base_steps, own_bits=bits)
+    @property
+    def rate_model(self) -> HACRateModel:
+        base = self.base_steps_like(self.features)
+        return HACRateModel(self.grid, self.mlp_grid, self.shape, self.base_steps, base, self.units, self.floors)
 
     @torch.no_grad()
     def fold_units(self) -> None:
@@ -162,15 +129,3 @@ class HACAnchors(CodedAnchors):
             found += [values.mean(dim=0), values.std(dim=0).clamp(min=step)]
         found.append(last.bias.new_zeros(len(last.bias) - sum(self.shape.outputs[:-1])))
         last.bias.copy_(torch.cat(found) / self.units)
-
-
-def context_of(
-    outputs: Tensor, shape: AnchorShape, base_steps: Sequence[float], *, own_bits: Tensor | None = None
-) -> AnchorContext:
-    """Read the float outputs [V, sum(shape.outputs)] of the network as means, deviations and steps."""
-    parts: Sequence[Tensor] = torch.split(outputs, shape.outputs, dim=1)
-    logits = torch.split(parts[6], 1, dim=1)
-    steps = [base * (1 + torch.tanh(t)).clamp(min=SMALLEST_STEP) for base, t in zip(base_steps, logits, strict=True)]
-    return AnchorContext(
-        (parts[0], parts[2], parts[4]), (parts[1], parts[3], parts[5]), (steps[0], steps[1], steps[2]), own_bits
-    )

@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sw_anchors.coded_anchors import ENTROPY, QUANTIZED
-from sw_anchors.fast.fused_ops import Weighted
-from sw_anchors.forecasts import AnchorRate
 from sw_anchors.phase_switch import PhaseSwitch
-from sw_anchors.stage import CodedAnchorStage
+from sw_anchors.rate_model import AnchorRate
+from sw_anchors.stage import CodedAnchorStage, Weighted
 
 from sw_hac.config import HACParams
 from sw_hac.model import HACAnchors

@@ -1,40 +1,31 @@
-"""Forecast of a training step from kept sites on the planes: all steps, but distributions of the sample alone.
-
-Plain form: `CatAnchors.predict` of all visible anchors, then `CatAnchors.refine` of the sample.
-"""
+"""Forecast of a training step from kept sites on the planes: all steps, but distributions of the sample alone."""
 
 from __future__ import annotations
 
 import torch
 from sw_anchors.anchors import linear_layers
 from sw_anchors.fast.predicted_steps import predicted_steps
-from sw_anchors.forecasts import AnchorForecast
+from sw_anchors.fast.rows import take_rows
+from sw_anchors.rate_model import AnchorForecast, Context, Rows
 from torch import Tensor, nn
 
 from sw_cat_3dgs.context import PLANES, STEP_OFFSET, CatContext
 from sw_cat_3dgs.fast.plane_sites import PlaneSites, sample
 
 
-def forecast(context: CatContext, sites: PlaneSites, base_steps: Tensor) -> AnchorForecast:
-    """Predict for training: V anchors at `sites` of the triplane; base_steps [3] of the shape.
+def fits(rows: Context) -> bool:
+    """Whether the rows are sites on the planes."""
+    return len(rows) == len(PlaneSites._fields)
 
-    All anchors have noise of their own steps; means and scales are computed for the sample alone.
-    """
+
+def forecast(context: CatContext, base: Tensor, rows: Context, drawn: Rows) -> AnchorForecast:
+    """As `rate_model.forecast`, for rows that are PlaneSites."""
+    assert isinstance(drawn, Tensor)
     first, last = linear_layers(context.network)
-    widths = context.shape.outputs[:-1]
-    weights = torch.split(last.weight, [sum(widths), PLANES])
-    biases = torch.split(last.bias, [sum(widths), PLANES])
-    features = sample(list(context.triplane.planes), sites, rounded=context.rounded)
+    count = sum(context.shape.outputs[:-1])
+    weights, biases = torch.split(last.weight, [count, PLANES]), torch.split(last.bias, [count, PLANES])
+    features = sample(list(context.triplane.planes), PlaneSites(*rows), rounded=context.rounded)
     parameters = (first.weight, first.bias, weights[1], biases[1])
-    steps, hidden = predicted_steps(features, parameters, base_steps, offset=STEP_OFFSET)
-
-    def of_sample(drawn: Tensor, hidden: Tensor | None, values: Tensor) -> tuple[Tensor, Tensor]:
-        assert hidden is not None
-        out = torch.split(nn.functional.linear(hidden, weights[0], biases[0]), widths, dim=1)
-        if context.in_steps:
-            units = (unit for unit in context.units for _ in (0, 1))
-            out = tuple(part * unit for part, unit in zip(out, units, strict=True))
-        means, scales = context.refined(out[0::2], out[1::2], values[:, : context.shape.features])
-        return torch.cat(means, dim=1), torch.cat(scales, dim=1)
-
-    return AnchorForecast(steps, None, hidden, of_sample)
+    steps, hidden = predicted_steps(features, parameters, base, offset=STEP_OFFSET)
+    sample_steps, own = take_rows(drawn, steps, hidden)
+    return AnchorForecast(steps, sample_steps, nn.functional.linear(own, weights[0], biases[0]))

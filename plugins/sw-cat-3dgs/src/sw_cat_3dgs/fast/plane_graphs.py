@@ -8,7 +8,7 @@ import math
 from typing import Any
 
 import torch
-from sw_anchors.fast.step_graphs import CapturedStep, FixedStep, Found, PlainStep, Watched, add_gradients
+from sw_anchors.fast.graphs import CapturedStep, FixedStep, Found, PlainStep, Watched, add_gradients
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 

@@ -11,10 +11,11 @@ from enum import IntEnum
 from typing import Any, Protocol
 
 import torch
+from sw_anchors.fast import sample_bits
+from sw_anchors.fast.sample_bits import summed_bits
+from sw_anchors.rate_model import SMALLEST_SCALE, AnchorForecast, Floors
 from torch import Tensor
 from torch.autograd.function import once_differentiable
-
-from sw_anchors.fast.row_kernels import bits_fit_kernel, summed_bits
 
 
 class Networks(Protocol):
@@ -76,9 +77,43 @@ class Predicted:
     masks: MaskKind
 
 
-def fit_mixture_kernel(*tensors: Tensor) -> bool:
+class Model(Protocol):
+    """What is asked of a rate model."""
+
+    @property
+    def base_steps(self) -> tuple[float, float, float]:
+        """Steps before they are predicted."""
+        ...
+
+    @property
+    def units(self) -> Tensor | None:
+        """Factors of the outputs."""
+        ...
+
+    @property
+    def floors(self) -> Floors:
+        """Floors of the rate."""
+        ...
+
+
+def fits(values: Tensor, forecast: AnchorForecast, masks: Tensor, counted: Tensor) -> bool:
     """Whether there are kernels for such tensors, all float32 of one device; loads them."""
-    return len({(t.device, t.dtype) for t in tensors}) == 1 and bits_fit_kernel(*tensors)
+    return sample_bits.fits(values, forecast.outputs, forecast.sample_steps, masks, counted)
+
+
+def rate(
+    model: Model, values: Tensor, forecast: AnchorForecast, masks: Tensor, counted: Tensor
+) -> tuple[Tensor, Tensor]:
+    """As `HACRateModel.bits`."""
+    given = (values, forecast.outputs, forecast.sample_steps, masks, counted)
+    return mixture_bits(*given, reading(model, forecast.outputs, MaskKind.ALONE))
+
+
+def reading(model: Model, outputs: Tensor, masks: MaskKind) -> Predicted:
+    """Return how a rate model reads its outputs [S,W], and what masks do to bits."""
+    units = outputs.new_ones(outputs.shape[1]) if model.units is None else model.units
+    bounds = (model.floors.probability, SMALLEST_SCALE, model.floors.scale)
+    return Predicted(units, model.base_steps[0], *bounds, masks)
 
 
 def mixture_bits(
@@ -91,7 +126,7 @@ def mixture_bits(
     networks: Networks | None = None,
     parameters: tuple[Tensor, ...] = (),
 ) -> tuple[Tensor, Tensor]:
-    """(bits of S anchors, differentiable; the same by group [3]), where `fit_mixture_kernel` says so.
+    """(bits of S anchors, differentiable; the same by group [3]), where it `fits`.
 
     x           [S,F+6+3k]
     outputs     [S,W] as `shape.AnchorShape` has them, then any others; with networks the last F are logits of the

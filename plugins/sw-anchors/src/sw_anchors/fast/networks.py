@@ -10,14 +10,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sw_anchors.native import ANCHORS
-
-Networks = tuple[nn.Sequential, nn.Sequential, nn.Sequential]
-"""Opacity (-> k), covariance (-> 7 k) and colour (-> 3 k), each Linear, ReLU, Linear on F + 4 inputs."""
-
+from sw_anchors.neural_gaussians import Networks
 
 MOST_FEATURES, MOST_HIDDEN, MOST_OUTPUTS, BLOCK_BYTES = 51, 51, (16, 80, 32), 164_352
 """That the CUDA kernel has room for, and the shared memory of its blocks: see kernels/cuda/networks.h."""
@@ -39,7 +36,7 @@ def parameters_of(networks: Networks) -> list[Tensor]:
     return [p for network in networks for layer in (network[0], network[2]) for p in (layer.weight, layer.bias)]
 
 
-def fit_kernel(positions: Tensor, features: Tensor, parameters: Sequence[Tensor]) -> bool:
+def fits_kernel(positions: Tensor, features: Tensor, parameters: Sequence[Tensor]) -> bool:
     """Whether there is a CUDA kernel for these networks, whose weights must fit into a block's memory; loads it."""
     if not all(t.is_cuda and t.dtype == torch.float32 for t in (positions, features, *parameters)):
         return False
@@ -57,7 +54,7 @@ class _Outputs(torch.autograd.Function):
     def forward(
         ctx: Any, center: Tensor, positions: Tensor, features: Tensor, *parameters: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        ctx.by_kernel = not ctx.needs_input_grad[1] and fit_kernel(positions, features, parameters)
+        ctx.by_kernel = not ctx.needs_input_grad[1] and fits_kernel(positions, features, parameters)
         if ctx.by_kernel:
             inputs = (center.contiguous(), positions.contiguous(), features)
             alpha, geometry, color = torch.ops.sw_anchors.view_networks(*inputs, list(parameters))

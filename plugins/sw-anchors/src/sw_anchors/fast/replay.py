@@ -1,4 +1,4 @@
-"""Decoding of the visible anchors of a training step in tensors of fixed sizes, for CUDA graphs.
+"""Training steps of a `CodedAnchors` as CUDA graphs, in tensors of fixed sizes.
 
 How many anchors a view sees differs from step to step. Here their rows are copied into tensors of a capacity, a few of
 which serve all views, and rows beyond the count are masked. So no shape depends on a value, and on a GPU the host
@@ -11,30 +11,63 @@ import functools
 import logging
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from splatwizard_core.api import Camera, GaussianInputs
-from sw_anchors.coded_anchors import ENTROPY
-from sw_anchors.fast.fixed_step import PARAMETERS, FixedRows, decode_rows, inputs_of, sample_capacity
-from sw_anchors.fast.fused_ops import add_rows, put_rows
-from sw_anchors.fast.pool_rows import PoolRows
-from sw_anchors.fast.seen_rows import SeenRows, capacity_of
-from sw_anchors.fast.step_graphs import CapturedStep, FixedStep, PlainStep, Watched, add_gradients
-
-if TYPE_CHECKING:
-    from sw_anchors.coded_anchors import CodedAnchors
+from splatwizard_core.api import Camera, GaussianInputs, Rasterizer
+from splatwizard_native import fast_enabled
+from sw_anchors.fast.fixed_step import (
+    PARAMETERS,
+    FixedRows,
+    PoolRows,
+    decode_rows,
+    inputs_of,
+    sample_capacity,
+)
+from sw_anchors.fast.graphs import CapturedStep, FixedStep, PlainStep, Watched, add_gradients
+from sw_anchors.fast.rows import add_rows, put_rows
+from sw_anchors.fast.seen_rows import ExpectedRows, SeenRows, capacity_of
+from sw_anchors.native import ANCHORS
+from sw_anchors.noisy_values import ENTROPY
+from sw_codecs.positions.morton import interleave
 
 log = logging.getLogger(__name__)
 
-MORE = 1.04
-"""Of the anchors that a camera saw last, as many are expected the next time."""
-KEPT = 16
-"""Capacities whose steps are kept; views of one scene ask for fewer."""
+CAPACITY_MARGIN = 1.04
+"""Head-room over the number of anchors that this camera saw last time."""
+MAX_STEPS = 16
+"""Steps kept per model; the views of one scene ask for fewer capacities."""
+
+Model = Any
+"""A `CodedAnchors`, which imports this: see `fixed_step.Model`."""
+
+
+def fits(model: Model, made_for: type) -> bool:
+    """Whether the steps of a model are replayed: in training on a GPU, if it draws Gaussians as `made_for` does."""
+    if not (fast_enabled() and model.training and torch.is_grad_enabled() and model.features.requires_grad):
+        return False
+    own = any(getattr(type(model), name) is not getattr(made_for, name) for name in _REPLACED)
+    return not own and (model in DECODERS or (model.device.type == "cuda" and ANCHORS.has_cuda()))
+
+
+_REPLACED = ("visible_anchors", "decode", "attributes")
+
+
+def gaussians(model: Model, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
+    """As `CodedAnchors.gaussians`. A view that was drawn before is decoded before the host knows how many it sees."""
+    decoder = DECODERS.get(model)
+    if decoder is None:
+        decoder = DECODERS[model] = FixedDecoder()
+    return decoder.gaussians(model, camera, rasterizer)
+
+
+def release(model: Model) -> None:
+    """Forget the steps of a model, whose graphs hold memory."""
+    DECODERS.pop(model, None)
 
 
 @dataclass(frozen=True)
@@ -49,8 +82,8 @@ class _Prepared:
 class FixedDecoder:
     """Decodes one CodedAnchors in training. A step is prepared when its capacity is first asked for.
 
-    All are prepared anew after a change of what decides the operators (`CodedAnchors.step_key`) or of a tensor of the
-    model that does not belong to single anchors (a network was replaced). Growth changes neither.
+    All are prepared anew after a change of what decides the operators (plain values of the model and of its rate model)
+    or of a tensor of the model that does not belong to single anchors (a network was replaced). Growth changes neither.
 
     captures    how many steps were prepared, since this was made
     """
@@ -66,6 +99,31 @@ class FixedDecoder:
         self._watched = Watched([])
         self._shared: dict[str, Tensor] = {}
         self._seen: WeakKeyDictionary[Camera, tuple[int, int]] = WeakKeyDictionary()  # anchors, and of how many
+        self._order: tuple[Tensor, Tensor] | None = None
+
+    def gaussians(self, model: Model, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
+        """The Gaussians of the visible anchors."""
+        places = self.expected(camera, model.num_rows)
+        with torch.no_grad():
+            order, seen = self._in_order(model, rasterizer.visible_filter(model.balls(), camera) > 0)
+            rows = SeenRows(order[seen]) if places is None else ExpectedRows(order, seen, places)
+        found = self.decode(model, camera, rows)
+        if found is None:
+            with torch.no_grad():
+                known = rows.known()
+            return model.decode(camera, known)
+        return found
+
+    def _in_order(self, model: Model, visible: Tensor) -> tuple[Tensor, Tensor]:
+        """Rows [N] int64 of all anchors, neighbours together, and whether each is visible [N].
+
+        Gradients of neighbours meet in the same cells of grids and planes: kernels add those up before they write.
+        """
+        codes = model.codes()
+        if self._order is None or self._order[0] is not codes:
+            self._order = codes, torch.argsort(interleave(codes))
+        order = self._order[1]
+        return order, visible.index_select(0, order)
 
     def expected(self, camera: Camera, num_rows: int) -> int | None:
         """Places for the anchors that this camera sees, of `num_rows`; None: not drawn before, or there are none.
@@ -75,12 +133,12 @@ class FixedDecoder:
         seen, of = self._seen.get(camera, (0, 0))
         if self._failed or not of or not num_rows:
             return None
-        return capacity_of(min(math.ceil(seen * num_rows / of * MORE), num_rows))
+        return capacity_of(min(math.ceil(seen * num_rows / of * CAPACITY_MARGIN), num_rows))
 
-    def decode(self, model: CodedAnchors, camera: Camera, rows: SeenRows) -> GaussianInputs | None:
+    def decode(self, model: Model, camera: Camera, rows: SeenRows) -> GaussianInputs | None:
         """Decode the anchors `rows`: their Gaussians with opacity > 0; once more where not all had a place.
 
-        None where the model has no form for it, or the GPU refused a graph or had no memory for it; that is said once.
+        None where the GPU refused a graph or had no memory for it; that is said once.
         """
         found = self._decode(model, camera, rows)
         if found is None and not rows.fit():
@@ -89,12 +147,12 @@ class FixedDecoder:
             self._seen[camera] = len(found.extras["anchors"].rows), model.num_rows
         return found
 
-    def _decode(self, model: CodedAnchors, camera: Camera, rows: SeenRows) -> GaussianInputs | None:
+    def _decode(self, model: Model, camera: Camera, rows: SeenRows) -> GaussianInputs | None:
         """As `decode`; None too where not all have a place."""
-        parts = model.context_rows() if model.phase == ENTROPY else ()
-        if self._failed or parts is None:
+        if self._failed:
             return None
-        pooled = model.SAMPLES_ALL and model.phase == ENTROPY
+        parts = model.context_rows() if model.phase == ENTROPY else ()
+        pooled = model.RATE_OF == "all" and model.phase == ENTROPY
         places = capacity_of(sample_capacity(model.num_rows, model.sample)) if pooled else 0
         try:
             prepared = self._prepared(model, parts, rows.capacity, places)
@@ -115,22 +173,25 @@ class FixedDecoder:
         results, others = _Decoded.found(prepared.step, rows, pool_rows, self._watched.learning, sources)
         return inputs_of(model, at, rows, (results, others))
 
-    def _prepared(self, model: CodedAnchors, parts: tuple[Tensor, ...], capacity: int, places: int) -> _Prepared:
-        key = (*model.step_key(), *(part.shape[1:] for part in parts))
+    def _prepared(self, model: Model, parts: tuple[Tensor, ...], capacity: int, places: int) -> _Prepared:
+        rate_model = model.rate_model if model.phase == ENTROPY else None
+        parts_of_it = [] if rate_model is None else [rate_model, *vars(rate_model).values()]
+        deciding = [model, *(each for each in parts_of_it if each is rate_model or isinstance(each, nn.Module))]
+        key = (*(_plain_values(each) for each in deciding), *(part.shape[1:] for part in parts))
         room = capacity <= self._rows_held("positions") and places <= self._rows_held("pool counted")
         if key != self._key or not self._watched.unchanged() or not room:
             self._drop()
             self._key, self._watched = key, Watched.of(model, {*model.ROWS, "bounds"})
         found = self._steps.get((capacity, places))
         if found is None:
-            if len(self._steps) >= KEPT:
+            if len(self._steps) >= MAX_STEPS:
                 held = self._shared
                 self._drop()
                 self._shared = held
             found = self._steps[capacity, places] = self._prepare(model, parts, capacity, places)
         return found
 
-    def _prepare(self, model: CodedAnchors, parts: tuple[Tensor, ...], capacity: int, places: int) -> _Prepared:
+    def _prepare(self, model: Model, parts: tuple[Tensor, ...], capacity: int, places: int) -> _Prepared:
         self.captures += 1
 
         def rows_like(name: str, tensor: Tensor, count: int = capacity) -> Tensor:
@@ -185,6 +246,21 @@ class FixedDecoder:
         if self._steps and self._graphs:
             torch.cuda.synchronize()
         self._steps, self._shared, self._pool = {}, {}, None
+
+
+DECODERS: WeakKeyDictionary[Any, FixedDecoder] = WeakKeyDictionary()
+
+
+def _plain_values(holder: object) -> list[Any]:
+    """Values of an object that decide which operators run: its numbers and words."""
+    return [(name, value) for name, value in vars(holder).items() if _is_plain(value)]
+
+
+def _is_plain(value: Any) -> bool:
+    return type(value) in _PLAIN or (type(value) is tuple and all(type(each) in _PLAIN for each in value))
+
+
+_PLAIN = (bool, int, float, str)
 
 
 class _Decoded(torch.autograd.Function):

@@ -12,22 +12,19 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sw_anchors.fast.view_networks import Networks, parameters_of
-from sw_anchors.native import ANCHORS
+from sw_anchors.fast.networks import parameters_of
+from sw_anchors.neural_gaussians import Networks, NeuralGaussians
 
 
-def fits_kernel(positions: Tensor, tensors: tuple[Tensor | None, ...], networks: Networks) -> bool:
-    """Whether there is a kernel for these tensors [V, ...] and networks; loads it. Positions must not learn."""
+def fits(positions: Tensor, networks: Networks) -> bool:
+    """Whether the kernel takes these networks, of float32 like all other tensors. Positions must not learn."""
     parameters = parameters_of(networks)
-    given = [positions, *(t for t in tensors if t is not None), *parameters]
-    if any(t.device.type != "cpu" or t.dtype != torch.float32 for t in given):
+    if any(t.device.type != "cpu" or t.dtype != torch.float32 for t in (positions, *parameters)):
         return False
-    if positions.requires_grad and torch.is_grad_enabled():
-        return False
-    return len({len(bias) for bias in parameters[1::4]}) == 1 and ANCHORS.try_load()
+    return not (positions.requires_grad and torch.is_grad_enabled()) and len({len(b) for b in parameters[1::4]}) == 1
 
 
-def spawn_by_kernel(
+def spawn(
     center: Tensor,
     positions: Tensor,
     features: Tensor,
@@ -35,18 +32,13 @@ def spawn_by_kernel(
     scales: Tensor,
     masks: Tensor | None,
     networks: Networks,
-) -> tuple[Tensor, ...]:
-    """Means, opacities, scales, quaternions, colours, then all opacities, those before masks, and `drawn`.
-
-    Arguments and results as of `neural_gaussians.spawn`, where `fits_kernel` says so.
-    """
-    found: tuple[Tensor, ...] = _ByHeads.apply(  # type: ignore[no-untyped-call]
-        center, positions, features, offsets, scales, masks, *parameters_of(networks)
-    )
-    return found
+) -> NeuralGaussians:
+    """As `neural_gaussians.spawn`, where it `fits`."""
+    found = _Heads.apply(center, positions, features, offsets, scales, masks, *parameters_of(networks))  # type: ignore[no-untyped-call]
+    return NeuralGaussians(*found)
 
 
-class _ByHeads(torch.autograd.Function):
+class _Heads(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
