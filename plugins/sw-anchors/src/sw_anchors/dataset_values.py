@@ -7,7 +7,12 @@ BungeeNeRF that goes with them is that of its family (sw-datasets).
 from collections.abc import Mapping
 from typing import Any
 
-RANDOM_START: Mapping[str, Any] = {"init_points": 100_000, "lr.mlp_opacity_early": 0.1}
+RANDOM_START: Mapping[str, Any] = {
+    "init_points": 100_000,
+    "paired_offsets": True,
+    "random_background_until": 1_500,
+    "lr.mlp_opacity_early": 0.1,
+}
 """Start of scenes in the Blender layout, which as a rule come without points (docs/methods/hac.md).
 
 The authors' code draws 10,000 points where the folder holds none of an earlier 3DGS training, and takes its 100,000

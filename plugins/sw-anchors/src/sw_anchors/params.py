@@ -85,6 +85,17 @@ class AnchorParams(OptimizationParams):
     num_offsets: int = Field(10, ge=1, le=64, description="Gaussians an anchor can spawn")
     feature_dim: int = Field(50, ge=1, le=256, description="numbers in an anchor's feature")
     hidden: int = Field(50, ge=1, le=256, description="width of the networks that decode Gaussians")
+    paired_offsets: bool = Field(
+        False,
+        description="start the opacity network with weights of opposite sign for the second half of the offsets: "
+        "half of them are visible whatever the seed; false: random ones as published, 1 to 9 of 10, the same for all "
+        "anchors",
+    )
+    random_background_until: int = Field(
+        0,
+        ge=0,
+        description="a fresh background colour per step up to this one, so that black anchors in empty space are seen",
+    )
     lr: AnchorLearningRates = Field(AnchorLearningRates(), description="step sizes")
     growth: AnchorGrowth = Field(AnchorGrowth(), description="growing and pruning of anchors")
     loss: AnchorLoss = Field(AnchorLoss(), description="distortion and regularisers")
