@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from sw_ray.executor import LOST, RayExecutor, RayOptions, status_of
-from sw_ray.work import work
+from sw_bench.ray_cluster import LOST, RayExecutor, RayOptions, status_of
+from sw_bench.ray_work import work
 
 from splatwizard_core.api import UserInputError
 
@@ -66,7 +66,7 @@ def ended(executor, count):
 
 def test_without_ray_the_package_to_install_is_named(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(UserInputError, match=r"pip install 'sw-ray\[ray\]'"):
+    with pytest.raises(UserInputError, match=r"pip install 'sw-bench\[ray\]'"):
         RayExecutor(RayOptions(), Site(tmp_path))
 
 

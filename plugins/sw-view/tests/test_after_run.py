@@ -9,8 +9,8 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from sw_viewer import plugin
-from sw_viewer.after_run import LONGEST_DECODE, MOST
+from sw_view import plugin
+from sw_view.after_run import LONGEST_DECODE, MOST
 
 from splatwizard_core.api import Scene, SceneError, SceneOptions
 from splatwizard_core.tooling import FinishedRun, FinishedRuns, load_plugins, load_scene
@@ -80,6 +80,6 @@ def test_a_defect_of_the_page_fails_no_finished_run(tmp_path, scene, monkeypatch
     def broken(*_: object) -> None:
         raise ZeroDivisionError("division by zero")
 
-    monkeypatch.setattr("sw_viewer.after_run.write_page", broken)
+    monkeypatch.setattr("sw_view.after_run.write_page", broken)
     page, (line,) = finish(tmp_path, lambda: scene)
     assert line.startswith(f"warning: {page} was not written: ZeroDivisionError: division by zero")

@@ -64,7 +64,7 @@ def test_wrong_input_is_told_in_a_line(tmp_path: Path, capsys):
 
 
 def test_a_format_that_nobody_writes_is_refused_before_the_fitting(tmp_path: Path, capsys, monkeypatch):
-    monkeypatch.setattr("sw_render.drawing.open_drawing", lambda *_: pytest.fail("the file was opened"))
+    monkeypatch.setattr("sw_view.drawing.open_drawing", lambda *_: pytest.fail("the file was opened"))
     assert main(["bake", str(GOLDEN / "hac_exact_v2.swz"), str(tmp_path / "o.xyz"), "--scene", "demo:tiny"]) == 2
     assert "no installed exporter writes '.xyz' files" in " ".join(capsys.readouterr().err.split())
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from sw_viewer.frames import (
+from sw_view.frames import (
     BUDGET,
     LARGEST_SIDE,
     LEAST_SHARE,
@@ -18,7 +18,7 @@ from sw_viewer.frames import (
     orientation_of,
     side_by_side,
 )
-from sw_viewer.shown_cameras import looked_at, surroundings_about, surroundings_of
+from sw_view.shown_cameras import looked_at, surroundings_about, surroundings_of
 
 from splatwizard_core.api import Camera, Protocol, Scene, SceneError, SceneOptions, View
 from splatwizard_core.tooling import load_plugins, load_scene

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 from sw_reference.rasterizer import ReferenceRasterizer
-from sw_render.colors import depth_colors, normal_colors, turbo
-from sw_render.drawing import Drawing
-from sw_render.map_files import MapFiles
-from sw_render.maps import MapRequest, maps_of
-from sw_render.modes import AUTO, DEPTHS, RENDERED, SURFACE
-from sw_render.views import draw_views
+from sw_view.colors import depth_colors, normal_colors, turbo
+from sw_view.drawing import Drawing
+from sw_view.map_files import MapFiles
+from sw_view.maps import MapRequest, maps_of
+from sw_view.modes import AUTO, DEPTHS, RENDERED, SURFACE
+from sw_view.views import draw_views
 
 from splatwizard_core.api import Camera, GaussianInputs, RasterOptions, UserInputError, View
 

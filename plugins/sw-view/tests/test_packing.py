@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from sw_gaussians.surfels import SurfelModel
-from sw_viewer.packing import CHUNK, LEAST_STEP, morton_order, pack
+from sw_view.packing import CHUNK, LEAST_STEP, morton_order, pack
 
 from splatwizard_core.api import SH_C0, GaussianModel, SceneError, SplatModel
 

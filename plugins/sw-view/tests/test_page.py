@@ -10,10 +10,10 @@ import subprocess
 from pathlib import Path
 
 import pytest
-import sw_viewer
+import sw_view
 import torch
 from sw_gaussians.ply import export_ply
-from sw_viewer.page_file import About, write_page
+from sw_view.page_file import About, write_page
 
 from splatwizard_core.api import GaussianModel
 from splatwizard_core.cli.main import main
@@ -118,7 +118,7 @@ def test_two_models_stand_in_one_page_and_are_seen_from_the_same_cameras(tmp_pat
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs node")
 def test_an_eye_goes_where_another_one_is():
     script = (
-        (Path(sw_viewer.__file__).parent / "page" / "camera.js").read_text("utf-8")
+        (Path(sw_view.__file__).parent / "page" / "camera.js").read_text("utf-8")
         + """
     const camera = { width: 4, height: 3, fx: 1, fy: 1, cx: 2, cy: 1.5, R: [1,0,0, 0,1,0, 0,0,1], tau: [0,0,2] };
     const facts = { up: [0,-1,0], pivot: [0,0,0], size: 1, cameras: [camera] };

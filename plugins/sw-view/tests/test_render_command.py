@@ -249,7 +249,7 @@ def test_exr_without_the_library_names_the_extra(tmp_path: Path, capsys, monkeyp
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
     said = refused(capsys, folder / "walls.ply", "--scene", "demo:tiny", "--out", tmp_path, "--depth=expected",
                    "--depth-exr")  # fmt: skip
-    assert "--depth-exr needs the package OpenEXR: pip install 'sw-render[exr]'" in said
+    assert "--depth-exr needs the package OpenEXR: pip install 'sw-view[exr]'" in said
     assert names_in(tmp_path) == set()
 
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from sw_viewer.entries import Opened, find_entries, open_entry
-from sw_viewer.exhibits import exhibit
-from sw_viewer.frames import camera_at, orientation_of
-from sw_viewer.looks import MODES
-from sw_viewer.shown_gaussians import ShownGaussians, shown_gaussians, sphere
+from sw_view.entries import Opened, find_entries, open_entry
+from sw_view.exhibits import exhibit
+from sw_view.frames import camera_at, orientation_of
+from sw_view.looks import MODES
+from sw_view.shown_gaussians import ShownGaussians, shown_gaussians, sphere
 
 from splatwizard_core.api import UserInputError
 from splatwizard_core.tooling import Choices, load_plugins

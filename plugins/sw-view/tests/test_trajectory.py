@@ -13,7 +13,7 @@ import pytest
 import torch
 from PIL import Image
 from sw_gaussians.ply import export_ply
-from sw_render.drawing import Drawing
+from sw_view.drawing import Drawing
 
 from splatwizard_core.api import GaussianModel, SceneOptions
 from splatwizard_core.cli.main import main
@@ -210,7 +210,7 @@ def test_what_makes_no_sense_is_told_in_a_line(
 def test_without_the_library_the_extra_is_named(tmp_path: Path, capsys, monkeypatch, ply: Path):
     monkeypatch.setitem(sys.modules, "av", None)
     said = refused(capsys, ply, "--trajectory", "orbit", "--video", tmp_path / "o.mp4")
-    assert "--video needs the package av: pip install 'sw-render[video]'" in said
+    assert "--video needs the package av: pip install 'sw-view[video]'" in said
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".webm"])

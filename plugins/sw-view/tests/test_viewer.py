@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 import torch
 from fake_viser import Client, Server
-from sw_viewer import frames
-from sw_viewer.command import view
-from sw_viewer.entries import find_all_entries
-from sw_viewer.exhibits import Exhibit
-from sw_viewer.live import LiveView
-from sw_viewer.shown_cameras import surroundings_about, surroundings_of
-from sw_viewer.shown_gaussians import ShownGaussians
-from sw_viewer.viewer import Viewer, start_server
-from sw_viewer.visitor import ELLIPSOIDS, SPLATS
+from sw_view import frames
+from sw_view.entries import find_all_entries
+from sw_view.exhibits import Exhibit
+from sw_view.live import LiveView
+from sw_view.shown_cameras import surroundings_about, surroundings_of
+from sw_view.shown_gaussians import ShownGaussians
+from sw_view.view_command import view
+from sw_view.viewer import Viewer, start_server
+from sw_view.visitor import ELLIPSOIDS, SPLATS
 
 from splatwizard_core.api import Camera, CapabilityError, GaussianModel, SceneOptions
 from splatwizard_core.cli.main import main
@@ -43,7 +43,7 @@ class Clock:
 def clock(monkeypatch) -> Clock:
     clock = Clock()
     for module in ("viewer", "visitor"):
-        monkeypatch.setattr(f"sw_viewer.{module}.time", clock)
+        monkeypatch.setattr(f"sw_view.{module}.time", clock)
     return clock
 
 
@@ -235,7 +235,7 @@ def test_who_left_is_drawn_for_no_more(clock):
 
 def test_without_viser_the_line_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(CapabilityError, match=r"pip install 'sw-viewer\[viser\]'"):
+    with pytest.raises(CapabilityError, match=r"pip install 'sw-view\[viser\]'"):
         start_server("127.0.0.1", 0)
 
 
@@ -249,7 +249,7 @@ def training(tmp_path) -> StartedTraining:
 @pytest.fixture
 def live(training, monkeypatch) -> tuple[LiveView, Server]:
     server = Server()
-    monkeypatch.setattr("sw_viewer.live.start_server", lambda _host, _port: server)
+    monkeypatch.setattr("sw_view.live.start_server", lambda _host, _port: server)
     return LiveView(training, 8080), server
 
 
@@ -287,7 +287,7 @@ def test_who_moves_takes_a_fifth_of_the_time_of_a_training_at_most(live, trainin
     observer, server = live
     server.connect()
     clock, drawn = Clock(), []
-    monkeypatch.setattr("sw_viewer.live.time", clock)
+    monkeypatch.setattr("sw_view.live.time", clock)
 
     def pump(_wait: float) -> None:
         drawn.append(clock.now)
@@ -325,7 +325,7 @@ def test_the_command_says_where_to_look_and_ends_cleanly(monkeypatch, capsys):
         calls.append(self.address)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sw_viewer.viewer.start_server", lambda host, port: server)
+    monkeypatch.setattr("sw_view.viewer.start_server", lambda host, port: server)
     monkeypatch.setattr(Viewer, "pump", interrupted)
     assert main(["view", str(golden)]) == 0
     told = capsys.readouterr()

@@ -20,10 +20,10 @@ import pytest
 import torch
 from headless_chromium import WEBGL, Chromium, find_chromium
 from PIL import Image
-from sw_viewer.entries import Opened, find_entries, open_entry
-from sw_viewer.exhibits import exhibit
-from sw_viewer.page_file import About, write_page
-from sw_viewer.shown_cameras import surroundings_of
+from sw_view.entries import Opened, find_entries, open_entry
+from sw_view.exhibits import exhibit
+from sw_view.page_file import About, write_page
+from sw_view.shown_cameras import surroundings_of
 
 from splatwizard_core.api import Camera, GaussianModel, RasterOptions, Scene, SceneOptions
 from splatwizard_core.tooling import Choices, NegotiatedRasterizer, load_plugins, load_scene, render_view
@@ -208,8 +208,8 @@ def opened() -> Opened:
 
 
 def test_a_browser_is_sent_the_picture_of_its_camera(browser, opened):
-    pytest.importorskip("viser", reason="pip install 'sw-viewer[viser]'")
-    from sw_viewer.viewer import Viewer, start_server
+    pytest.importorskip("viser", reason="pip install 'sw-view[viser]'")
+    from sw_view.viewer import Viewer, start_server
 
     viewer = Viewer(start_server("127.0.0.1", 0), opened.around, ["golden"], lambda _label: exhibit(opened))
     done = threading.Event()

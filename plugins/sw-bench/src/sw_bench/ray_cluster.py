@@ -16,7 +16,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from splatwizard_core.api import UserInputError
-from sw_ray.work import PATIENCE_SECONDS, work
+from sw_bench.ray_work import PATIENCE_SECONDS, work
 
 LOST = -1000  # by the contract of executors
 KILLED = -9  # SIGKILL
@@ -52,7 +52,7 @@ class RayExecutor:
         try:
             import ray
         except ImportError:
-            raise UserInputError("executor 'ray' needs Ray: pip install 'sw-ray[ray]'") from None
+            raise UserInputError("executor 'ray' needs Ray: pip install 'sw-bench[ray]'") from None
         self._ray: Any = ray
         self._options = options
         self._tasks: dict[Any, tuple[str, Path]] = {}

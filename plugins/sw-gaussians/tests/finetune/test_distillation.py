@@ -5,8 +5,8 @@ import json
 
 import pytest
 import torch
-from sw_finetuning.distillation import DistillationStage, PseudoViewSampler, distillation_loss
-from sw_finetuning.fine_tuning import FineTuningRates, FineTuningStage
+from sw_gaussians.finetune.distillation import DistillationStage, PseudoViewSampler, distillation_loss
+from sw_gaussians.finetune.fine_tuning import FineTuningRates, FineTuningStage
 
 from splatwizard_core.scene.scene import View
 from splatwizard_core.training.params import OptimizationParams, PipelineParams

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from sw_finetuning.fine_tuning import (
+from sw_gaussians.finetune.fine_tuning import (
     FineTuningRates,
     FineTuningStage,
     UpdateRates,

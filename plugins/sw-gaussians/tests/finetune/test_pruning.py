@@ -4,7 +4,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from sw_finetuning.pruning import PruneByScore, lowest, removal_count, scores_of, up_to
+from sw_gaussians.finetune.pruning import PruneByScore, lowest, removal_count, scores_of, up_to
 
 from splatwizard_core.errors import EmptyModel, ShapeError
 from splatwizard_core.gaussians.model import GaussianModel

@@ -1,3 +1,3 @@
-"""Decoded scenes in the browser: drawn by a server, or in one HTML file that needs none."""
+"""Pictures, maps and videos of decoded scenes, a viewer in the browser, and one HTML file that needs no server."""
 
 __version__ = "0.2.0"

@@ -9,8 +9,8 @@ import torch
 
 from splatwizard_core.api import ForeseenError, GaussianModel
 from splatwizard_core.tooling import FinishedRun, load_plugins, open_model
-from sw_viewer.page_file import FILE_NAME, About, write_page
-from sw_viewer.shown_cameras import surroundings_of
+from sw_view.page_file import FILE_NAME, About, write_page
+from sw_view.shown_cameras import surroundings_of
 
 MOST = 200_000
 """Gaussians: a page of more has over 10 MB, and is written where somebody asks for it (`sw view RUN --html`)."""

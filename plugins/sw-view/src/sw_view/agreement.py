@@ -12,7 +12,7 @@ from splatwizard_core.api import track
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Camera, View
-    from sw_render.drawing import Drawing
+    from sw_view.drawing import Drawing
 
 
 def mean_psnr(drawing: Drawing, cameras: Sequence[Camera], other: Drawing | Callable[[int], Tensor]) -> float:

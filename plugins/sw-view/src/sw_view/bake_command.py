@@ -38,7 +38,7 @@ from splatwizard_core.tooling import (
     scene_option, images_option, config_option, set_option,
     click.option(
         "--cameras", type=EXISTING, metavar="FILE",
-        help="JSON of the cameras to fit to (README of sw-render).  [default: the scene's training cameras]",
+        help="JSON of the cameras to fit to (README of sw-view).  [default: the scene's training cameras]",
     ),
     click.option(
         "--sh-degree", type=click.IntRange(0, 3), default=2, show_default=True, help="Of the colours, fitted by view."
@@ -68,8 +68,8 @@ def bake(
     from sw_gaussians.baking import bake as bake_model
     from sw_gaussians.camera_files import read_cameras
 
-    from sw_render.agreement import mean_psnr, truth_of
-    from sw_render.drawing import encoded_file, open_drawing
+    from sw_view.agreement import mean_psnr, truth_of
+    from sw_view.drawing import encoded_file, open_drawing
 
     if file.is_dir():
         chosen = replace(chosen, config_file=chosen.config_file or str(file / "config.toml"))

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sw_gaussians.baking import bake
-from sw_render.drawing import Drawing
 
 from splatwizard_core.api import (
     ContainerReader,
@@ -20,9 +19,10 @@ from splatwizard_core.api import (
     UserInputError,
 )
 from splatwizard_core.tooling import Choices, NegotiatedRasterizer, bytes_with_named, open_session, open_subject
-from sw_viewer.packing import solid_means
-from sw_viewer.page_file import MADE_UP, About
-from sw_viewer.shown_cameras import Surroundings, surroundings_about, surroundings_of
+from sw_view.drawing import Drawing
+from sw_view.packing import solid_means
+from sw_view.page_file import MADE_UP, About
+from sw_view.shown_cameras import Surroundings, surroundings_about, surroundings_of
 
 ENCODED, CONFIG = "scene.swz", "config.toml"
 MOST = 200

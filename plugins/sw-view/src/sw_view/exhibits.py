@@ -6,10 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from splatwizard_core.api import Camera
-from sw_viewer.entries import Opened
-from sw_viewer.frames import Pixels
-from sw_viewer.looks import look
-from sw_viewer.shown_gaussians import ShownGaussians, shown_gaussians
+from sw_view.entries import Opened
+from sw_view.frames import Pixels
+from sw_view.looks import look
+from sw_view.shown_gaussians import ShownGaussians, shown_gaussians
 
 
 @dataclass(frozen=True)

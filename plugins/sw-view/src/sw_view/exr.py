@@ -17,7 +17,7 @@ def exr_library() -> ModuleType:
         import OpenEXR
     except ImportError as error:
         raise UserInputError(
-            "--depth-exr needs the package OpenEXR: pip install 'sw-render[exr]' (.npz holds the same values)"
+            "--depth-exr needs the package OpenEXR: pip install 'sw-view[exr]' (.npz holds the same values)"
         ) from error
     library: ModuleType = OpenEXR
     return library

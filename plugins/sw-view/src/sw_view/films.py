@@ -12,14 +12,14 @@ import torch
 from numpy.typing import NDArray
 
 from splatwizard_core.api import track
-from sw_render.colors import depth_colors, depth_range, normal_colors
-from sw_render.maps import MapRequest, Maps, maps_of
-from sw_render.video import video_file
+from sw_view.colors import depth_colors, depth_range, normal_colors
+from sw_view.maps import MapRequest, Maps, maps_of
+from sw_view.video import video_file
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Camera
-    from sw_render.drawing import Drawing
-    from sw_render.trajectory import Trajectory
+    from sw_view.drawing import Drawing
+    from sw_view.trajectory import Trajectory
 
 PROBES = 8
 """Frames that are drawn beforehand to find the depths that the colours of a video span."""

@@ -8,18 +8,18 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import torch
-from sw_render.drawing import Drawing
 
 from splatwizard_core.api import Camera, RasterOptions, SplatModel
 from splatwizard_core.tooling import NegotiatedRasterizer, StartedTraining, say
-from sw_viewer.exhibits import Exhibit
-from sw_viewer.looks import look
-from sw_viewer.shown_cameras import surroundings_of
-from sw_viewer.shown_gaussians import shown_gaussians
-from sw_viewer.viewer import Viewer, start_server
+from sw_view.drawing import Drawing
+from sw_view.exhibits import Exhibit
+from sw_view.looks import look
+from sw_view.shown_cameras import surroundings_of
+from sw_view.shown_gaussians import shown_gaussians
+from sw_view.viewer import Viewer, start_server
 
 if TYPE_CHECKING:
-    from sw_viewer.frames import Pixels
+    from sw_view.frames import Pixels
 
 HOST = "127.0.0.1"
 EVERY = 1.0

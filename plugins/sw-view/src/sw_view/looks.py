@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import torch
-from sw_render.colors import depth_colors, normal_colors
-from sw_render.drawing import Drawing
-from sw_render.maps import MapRequest, maps_of
-from sw_render.modes import AUTO
 
 from splatwizard_core.api import Camera
-from sw_viewer.frames import Pixels
+from sw_view.colors import depth_colors, normal_colors
+from sw_view.drawing import Drawing
+from sw_view.frames import Pixels
+from sw_view.maps import MapRequest, maps_of
+from sw_view.modes import AUTO
 
 PICTURE, DEPTH, NORMALS = "picture", "depth", "normals"
 MODES = (PICTURE, DEPTH, NORMALS)

@@ -13,10 +13,10 @@ from torch import Tensor
 
 from splatwizard_core.api import Camera, UserInputError, replacing
 from splatwizard_core.tooling import write_json
-from sw_render.colors import depth_colors, normal_colors
-from sw_render.exr import write_exr
-from sw_render.maps import MapRequest, Maps
-from sw_render.modes import DEPTHS, NORMALS, RENDERED, SURFACE
+from sw_view.colors import depth_colors, normal_colors
+from sw_view.exr import write_exr
+from sw_view.maps import MapRequest, Maps
+from sw_view.modes import DEPTHS, NORMALS, RENDERED, SURFACE
 
 LARGEST = 65_535
 """Of a 16-bit PNG."""

@@ -13,7 +13,7 @@ from sw_gaussians.surface import depth_modes, depth_normals, surface_depth, worl
 from torch import Tensor
 
 from splatwizard_core.api import Camera, RasterOptions, RenderResult, UserInputError
-from sw_render.modes import AUTO, DRAWN, RENDERED, SURFACE
+from sw_view.modes import AUTO, DRAWN, RENDERED, SURFACE
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from sw_gaussians.drawn_as import antialias_of, eps2d_of
 
 from splatwizard_core.api import Camera, SplatModel, replacing
-from sw_viewer.packing import pack
-from sw_viewer.shown_cameras import NamedCamera, Surroundings, surroundings_about
+from sw_view.packing import pack
+from sw_view.shown_cameras import NamedCamera, Surroundings, surroundings_about
 
 SCRIPTS = ("data.js", "renderer.js", "camera.js", "main.js")
 MADE_UP = "Nothing was known of the scene's cameras: these were made up around the Gaussians, with -y as up."
@@ -131,4 +131,4 @@ def _numbers(values: NDArray[Any]) -> list[float]:
 
 
 def _text(name: str) -> str:
-    return (files("sw_viewer") / "page" / name).read_text(encoding="utf-8")
+    return (files("sw_view") / "page" / name).read_text(encoding="utf-8")

@@ -1,4 +1,7 @@
-"""Registers `sw view` and the exporter of the one-file page; shows trainings, and leaves a page in run directories."""
+"""Registers `sw render`, `sw bake`, `sw view` and the exporter of the one-file page.
+
+It also shows trainings while they run, and leaves a page in run directories.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +15,16 @@ if TYPE_CHECKING:
 
 @hookimpl
 def register_commands(registry: Registry) -> None:
-    registry.add("view", "sw_viewer.command:view", position=4.65, summary="look at decoded models in the browser")
+    registry.add("render", "sw_view.render_command:render", position=4.5,
+                 summary="draw an encoded scene: pictures, depth, normals")  # fmt: skip
+    registry.add("bake", "sw_view.bake_command:bake", position=4.6,
+                 summary="make explicit Gaussians of anchors, for viewers")  # fmt: skip
+    registry.add("view", "sw_view.view_command:view", position=4.65, summary="look at decoded models in the browser")
 
 
 @hookimpl
 def register_exporters(registry: Registry) -> None:
-    registry.add("html", "sw_viewer.page_file:export_page", suffix=".html",
+    registry.add("html", "sw_view.page_file:export_page", suffix=".html",
                  summary="one page that shows the Gaussians in any browser, offline")  # fmt: skip
 
 
@@ -25,7 +32,7 @@ def register_exporters(registry: Registry) -> None:
 def run_started(training: StartedTraining) -> TrainingObserver | None:
     if not training.log.view:
         return None
-    from sw_viewer.live import LiveView
+    from sw_view.live import LiveView
 
     return LiveView(training, training.log.view)
 
@@ -34,7 +41,7 @@ def run_started(training: StartedTraining) -> TrainingObserver | None:
 def run_finished(runs: FinishedRuns) -> None:
     if runs.complete:
         return
-    from sw_viewer.after_run import show_finished
+    from sw_view.after_run import show_finished
 
     for run in runs.runs:
         show_finished(run, runs.say)

@@ -27,7 +27,7 @@ from splatwizard_core.tooling import (
     set_option,
     takes_choices,
 )
-from sw_render.modes import AUTO, DEPTHS, NORMALS, PATHS
+from sw_view.modes import AUTO, DEPTHS, NORMALS, PATHS
 
 
 def _modes(_context: click.Context, _parameter: click.Parameter, value: str | None) -> tuple[str, ...]:
@@ -131,16 +131,16 @@ def render(
     FILE is a .swz, a .ply, or a run directory: then its scene.swz. Without --scene the scene is that of the run
     directory, or of the one that the file lies in. Any method can be drawn with depth; only surfels have normals of
     their own. With --trajectory the cameras move, and --video makes one file of the frames. What the arrays hold, and
-    the JSON of cameras, is in the README of sw-render.
+    the JSON of cameras, is in the README of sw-view.
     """
-    from sw_render.drawing import encoded_file, open_drawing
-    from sw_render.exr import exr_library
-    from sw_render.films import draw_films
-    from sw_render.map_files import MapFiles
-    from sw_render.maps import MapRequest
-    from sw_render.trajectory import even, make_trajectory
-    from sw_render.video import check_video
-    from sw_render.views import draw_views
+    from sw_view.drawing import encoded_file, open_drawing
+    from sw_view.exr import exr_library
+    from sw_view.films import draw_films
+    from sw_view.map_files import MapFiles
+    from sw_view.maps import MapRequest
+    from sw_view.trajectory import even, make_trajectory
+    from sw_view.video import check_video
+    from sw_view.views import draw_views
 
     if normals not in (None, AUTO, *NORMALS):
         raise click.UsageError(f"--normals has no kind '{normals}': {' or '.join(NORMALS)}")

@@ -10,10 +10,10 @@ from sw_gaussians.camera_files import read_cameras
 from sw_gaussians.camera_paths import along, orbit, seen_depths, spiral
 
 from splatwizard_core.api import Camera, SceneError, UserInputError, View
-from sw_render.modes import PATHS
+from sw_view.modes import PATHS
 
 if TYPE_CHECKING:
-    from sw_render.drawing import Drawing
+    from sw_view.drawing import Drawing
 
 FRAMES, FPS = 120, 30.0
 """Of a path that is made here, unless told otherwise: four seconds."""

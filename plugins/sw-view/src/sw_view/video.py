@@ -32,7 +32,7 @@ def video_library() -> ModuleType:
         import av
     except ImportError as error:
         raise UserInputError(
-            "--video needs the package av: pip install 'sw-render[video]' (without --video the frames are PNG files)"
+            "--video needs the package av: pip install 'sw-view[video]' (without --video the frames are PNG files)"
         ) from error
     library: ModuleType = av
     return library

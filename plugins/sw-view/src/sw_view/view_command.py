@@ -55,14 +55,14 @@ def view(
 
     PATH is a .swz, a .ply, a run directory, or a folder with run directories below it. The cameras are those of
     --scene, else of the run's scene; without either they are made up around the Gaussians. Needs viser,
-    the extra [viser] of sw-viewer; --html does not.
+    the extra [viser] of sw-view; --html does not.
     """
-    from sw_viewer.entries import about_page, find_all_entries, fixed_gaussians, open_entry
+    from sw_view.entries import about_page, find_all_entries, fixed_gaussians, open_entry
 
     plugins = load_plugins()
     entries = find_all_entries(paths)
     if page is not None:
-        from sw_viewer.page_file import write_page, write_pair
+        from sw_view.page_file import write_page, write_pair
 
         if len(entries) > MOST_IN_A_PAGE:
             raise click.UsageError(
@@ -81,9 +81,9 @@ def view(
         print_facts(facts, as_json, f"{facts['bytes']:,} bytes: {page}")
         return
 
-    from sw_viewer.exhibits import Exhibit, exhibit
-    from sw_viewer.looks import PICTURE
-    from sw_viewer.viewer import Viewer, start_server, stop_server
+    from sw_view.exhibits import Exhibit, exhibit
+    from sw_view.looks import PICTURE
+    from sw_view.viewer import Viewer, start_server, stop_server
 
     server = start_server(host, port)
     try:

@@ -16,16 +16,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from splatwizard_core.api import Camera, CapabilityError, ForeseenError
-from sw_viewer.exhibits import Exhibit
-from sw_viewer.frames import REST, Pixels, orientation_of, side_by_side
-from sw_viewer.shown_cameras import Surroundings
-from sw_viewer.shown_gaussians import ShownGaussians, sphere
-from sw_viewer.visitor import ELLIPSOIDS, NOTHING, SPLATS, Visitor
+from sw_view.exhibits import Exhibit
+from sw_view.frames import REST, Pixels, orientation_of, side_by_side
+from sw_view.shown_cameras import Surroundings
+from sw_view.shown_gaussians import ShownGaussians, sphere
+from sw_view.visitor import ELLIPSOIDS, NOTHING, SPLATS, Visitor
 
 if TYPE_CHECKING:
     import viser
 
-INSTALL = "pip install 'sw-viewer[viser]'"
+INSTALL = "pip install 'sw-view[viser]'"
 QUALITY_MOVING, QUALITY_STILL = 70, 92  # JPEG
 
 

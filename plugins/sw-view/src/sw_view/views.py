@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 from splatwizard_core.api import track
 from splatwizard_core.tooling import png_names, save_png
-from sw_render.maps import maps_of
+from sw_view.maps import maps_of
 
 if TYPE_CHECKING:
     from splatwizard_core.api import View
-    from sw_render.drawing import Drawing
-    from sw_render.map_files import MapFiles
+    from sw_view.drawing import Drawing
+    from sw_view.map_files import MapFiles
 
 
 def draw_views(drawing: Drawing, views: Sequence[View], folder: Path, maps: MapFiles) -> list[str]:

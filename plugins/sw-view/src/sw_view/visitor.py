@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from splatwizard_core.api import Camera
-from sw_viewer.frames import Pace, camera_at, frame_size, orientation_of
-from sw_viewer.looks import MODES, PICTURE
-from sw_viewer.shown_cameras import NamedCamera, Surroundings
+from sw_view.frames import Pace, camera_at, frame_size, orientation_of
+from sw_view.looks import MODES, PICTURE
+from sw_view.shown_cameras import NamedCamera, Surroundings
 
 if TYPE_CHECKING:
     import viser

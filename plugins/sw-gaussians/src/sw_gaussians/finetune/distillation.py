@@ -23,7 +23,7 @@ from splatwizard_core.api import (
     View,
     photometric_loss,
 )
-from sw_finetuning.fine_tuning import FineTuningRates, FineTuningStage
+from sw_gaussians.finetune.fine_tuning import FineTuningRates, FineTuningStage
 
 DistillLoss = Literal["l1_ssim", "l2"]
 

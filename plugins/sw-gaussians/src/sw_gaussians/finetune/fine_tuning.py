@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from pydantic import Field
-from sw_gaussians.learning_rate import exponential_lr
-from sw_gaussians.statistics import clear_statistics, collect_statistics
 from torch import Tensor
 
 from splatwizard_core.api import (
@@ -27,6 +25,8 @@ from splatwizard_core.api import (
     View,
     photometric_loss,
 )
+from sw_gaussians.learning_rate import exponential_lr
+from sw_gaussians.statistics import clear_statistics, collect_statistics
 
 CLEAR = -1  # before the same step's statistics are added
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.api import CameraIterator, GaussianModel, Pruner, Rasterizer, Scene
-from sw_finetuning.pruning import scores_of
+from sw_gaussians.finetune.pruning import scores_of
 
 
 class ScoredGaussians(GaussianModel):

@@ -1,4 +1,4 @@
-// From the text in the page to what the GPU reads. The layout is that of sw_viewer/packing.py.
+// From the text in the page to what the GPU reads. The layout is that of sw_view/packing.py.
 async function unpacked(text) {
   const binary = atob(text.trim()), bytes = new Uint8Array(binary.length);
   for (let i = 0; i < binary.length; i++) bytes[i] = binary.charCodeAt(i);
