@@ -1,4 +1,4 @@
-"""Packages of 0.2 that are part of others now: their import paths, requirements on them, and old ones still installed."""
+"""Packages of 0.2 that are part of others now: their import paths, requirements on them, and old ones left behind."""
 
 from __future__ import annotations
 
