@@ -90,6 +90,11 @@ def test_what_was_written_for_the_old_packages_works_beside_what_is_left_of_them
         assert re.search(rf"uninstall it, then \S*pip install --force-reinstall --no-deps .*{home}", line)
 
 
+def test_plugins_are_chosen_by_their_old_names_too(site):
+    names = site.listed(SW_PLUGINS="render,sw-formats").names
+    assert names == {"splatwizard-core", "sw-view", "sw-interchange"}
+
+
 def test_a_requirement_on_an_old_package_names_the_new_one_where_that_is_gone(tmp_path, monkeypatch):
     info = tmp_path / "sw_of_0_2-0.1.dist-info"
     info.mkdir()

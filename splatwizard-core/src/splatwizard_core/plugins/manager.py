@@ -209,6 +209,9 @@ def _chosen(
     found.sort(key=lambda each: (not each[0].is_core, each[0].foreign, each[0].key, each[0].distribution))
     if only is None:
         return found
+    # One that became part of another package is that one, as a distribution or by the name of its entry point.
+    homes = {name: now for old, now in superseded().items() for name in (old, old.partition("-")[2])}
+    only = {homes.get(normal_name(name), name) for name in only}
     unknown = [name for name in sorted(only) if not any(normal_name(name) in loading.names_of(e) for _, e in found)]
     if unknown:
         raise PluginError(
