@@ -41,7 +41,7 @@ def test_the_metadata_of_a_wheel_is_complete(project: Path, tmp_path: Path, monk
 def test_a_wheel_carries_the_licence_and_the_types(tmp_path: Path):
     (wheel,) = build_wheels([ROOT / "plugins" / "sw-3dgs"], tmp_path)
     names = zipfile.ZipFile(wheel).namelist()
-    assert "sw_3dgs-0.2.0.dist-info/licenses/LICENSE" in names
+    assert f"sw_3dgs-{__version__}.dist-info/licenses/LICENSE" in names
     assert "sw_3dgs/py.typed" in names
 
 
