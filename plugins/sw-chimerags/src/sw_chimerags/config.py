@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
 from pydantic import Field
-from sw_finetuning.distillation import DistillLoss
-from sw_finetuning.fine_tuning import FineTuningRates
 from sw_gaussians.choices import Choice, Choosing, Moved, PrunerChoice
+from sw_gaussians.finetune.distillation import DistillLoss
+from sw_gaussians.finetune.fine_tuning import FineTuningRates
 
 from splatwizard_core.api import Params
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from sw_finetuning.volume import volume_factor
+from sw_gaussians.finetune.volume import volume_factor
 from sw_gaussians.surfels import refuse_surfels
 from torch import Tensor
 

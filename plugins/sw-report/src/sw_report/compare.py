@@ -36,7 +36,7 @@ GENERATED, SIZE = 12, (512, 512)
     scene_option, images_option, set_option,
     click.option(
         "--cameras", type=EXISTING, metavar="FILE",
-        help="JSON of the cameras to draw from (README of sw-render).  [default: the scene's test views; without a "
+        help="JSON of the cameras to draw from (README of sw-view).  [default: the scene's test views; without a "
         "scene 12 cameras around the Gaussians]",
     ),
     click.option("--published", is_flag=True, help="Compare runs with published figures of their data set and scene."),
