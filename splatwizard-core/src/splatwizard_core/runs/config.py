@@ -227,6 +227,11 @@ def read_config_file(path: str | Path) -> dict[str, Any]:
     return tables
 
 
+def is_whole(path: str | Path) -> bool:
+    """Whether a file is the config.toml of a run, which says everything: it names method, preset, rate and scene."""
+    return set(RESERVED) <= set(read_config_file(path))
+
+
 def parse_set(assignments: Sequence[str]) -> dict[str, str]:
     """Split `["a.b=1", ...]` into {"a.b": "1", ...}; a later one wins."""
     values: dict[str, str] = {}

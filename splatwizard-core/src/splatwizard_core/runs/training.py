@@ -240,7 +240,7 @@ def _train_stages(
             directory=directory / CHECKPOINTS, identity=identity, trained=frozen, stop_after=stop_after,
             resume=request.resume, allow_changed_plan=request.allow_changed_plan, on_step=after_step,
             read_identity=lambda stored: stored_beside(plugins, stored, identity),
-            evaluate=test_metrics, log_path=directory / LOG, provided=parts.since_asked,
+            evaluate=test_metrics, log_path=directory / LOG, provided=parts.since_asked, say=session.say,
         ).train()  # fmt: skip
     return outcome.model, {
         **{name: getattr(outcome, name) for name in TrainBlock.model_fields if hasattr(outcome, name)},
