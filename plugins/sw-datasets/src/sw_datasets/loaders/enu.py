@@ -67,7 +67,7 @@ def load_enu(path: Path, rules: Rules, options: SceneOptions) -> Scene:
         path.resolve().name,
         views,
         points=points_in_sight([view.camera for view in views], options.init_points, options.seed),
-        protocol=rules.protocol(masked=gate.masked),
+        protocol=rules.protocol(masked=gate.masked, turned=gate.turned),
         path=str(path),
         warnings=warnings,
         finds_lists=rules.finds_lists,

@@ -91,7 +91,7 @@ class TransformsDataset:
             path.resolve().name,
             found.views,
             points=points,
-            protocol=rules.protocol("frames", masked=gate.masked),
+            protocol=rules.protocol("frames", masked=gate.masked, turned=gate.turned),
             path=str(path),
             own_lists=found.lists,
             warnings=warnings,
