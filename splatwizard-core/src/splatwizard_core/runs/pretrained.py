@@ -100,6 +100,11 @@ def for_starts(plugins: PluginManager, resolved: ResolvedConfig, keys: Iterable[
     }  # fmt: skip
 
 
+def own_start(resolved: ResolvedConfig) -> str:
+    """Return the file that a method with an input file `init` starts from; empty: none."""
+    return str(value_at(resolved.config, INIT)) if INIT in input_files(type(resolved.config)) else ""
+
+
 def checked_start(plugins: PluginManager, resolved: ResolvedConfig) -> ResolvedConfig:
     """Return the configuration with its start checked, and the values of `pretrained.KEY` parsed.
 
@@ -131,8 +136,7 @@ def checked_start(plugins: PluginManager, resolved: ResolvedConfig) -> ResolvedC
             parsed |= {k: value_at(base.config, k) for k in parsed if field_at(type(base.config), k) is not None}
             checked_start(plugins, base)
         resolved = replace(resolved, pretrained=parsed)
-    own = str(value_at(resolved.config, INIT)) if INIT in input_files(type(resolved.config)) else ""
-    for path in filter(None, (resolved.init, own)):
+    for path in filter(None, (resolved.init, own_start(resolved))):
         stamp = os.stat(path).st_mtime_ns if os.path.exists(path) else 0
         _checked_once(path, stamp)  # a command with many rate points asks as often
     return resolved

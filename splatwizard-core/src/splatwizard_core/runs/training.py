@@ -71,7 +71,9 @@ def _trained_in(home: Path, session: Session, request: RunRequest, key: str, sto
     steps, done = StepLog(home), _finished(session, home, key)
     if done is None:
         scene = session.scene(resolved)
-        session.say(f"training {resolved.method} on {scene.name} ({resolved.preset} preset, {session.device})")
+        own = pretrained.own_start(resolved)
+        start = f", from {own} in place of the scene's points" if own else ""
+        session.say(f"training {resolved.method} on {scene.name} ({resolved.preset} preset, {session.device}){start}")
         if not CheckpointStore(home / CHECKPOINTS).paths():  # those of another training are refused, and stay as is
             steps.finish(BEGUN, key, {})  # whoever wants the same scene meanwhile may wait for it
     request = replace(request, resume=request.resume or done is not None)
