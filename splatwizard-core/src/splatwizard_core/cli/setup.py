@@ -152,7 +152,9 @@ class Choices:
         for key, value in flatten(PipelineParams, tables).items():
             if key not in RESERVED and (key in SCENE_KEYS or field_at(PipelineParams, key) is not None):
                 from_file[key] = value
-        return resolve(NoMethod, "paper", sets={**from_file, **values}, scene=self.scene or tables.get("scene"))
+        found = resolve(NoMethod, "paper", sets={**from_file, **values}, scene=self.scene or tables.get("scene"))
+        sources = {key: str(file) for key in from_file if key not in values}
+        return replace(found, provenance={**found.provenance, **sources})
 
     def of_file(self, path: Path, tell: Callable[[str], None] = say) -> Choices:
         """The same for what looks at a file on a scene: where none is named, that of the file's run directory, as it
