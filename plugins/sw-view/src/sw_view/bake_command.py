@@ -85,6 +85,8 @@ def bake(
     refine_model(model, drawing.model, fitted, drawing.rasterizer, drawing.options, steps=refine, generator=generator)
     asked = drawing.rasterizer.decided(drawing.options)
     model.origin = {"raster": {"antialias": asked.antialias, "eps2d": asked.eps2d}}
+    if any(drawing.scene.origin):
+        model.origin["world_origin"] = list(drawing.scene.origin)  # for `sw export --world`
     baked = replace(drawing, model=model)
     export_model(model, out, plugins, name)
     psnr: dict[str, Any] = {"to_model_at_fitted": mean_psnr(baked, fitted, drawing)}
