@@ -82,6 +82,7 @@ kernels: $(VENV)/.ready
 docs: $(VENV)/.ready
 	$(BIN)/python tools/cli_docs.py docs/cli.md
 	$(BIN)/python tools/make_catalogue.py
+	$(BIN)/python tools/record_docs.py
 
 $(VENV)/bin/python:
 	@PYTHON=$(PYTHON) tools/check-system python

@@ -23,8 +23,8 @@ from import_graph import (
 
 import splatwizard_native
 
-BELOW_ALL = {"errors", "streams"}
-"""Single modules that know no room."""
+BELOW_ALL = {"errors", "streams", "base"}
+"""Modules and a room of plain tools that know no room."""
 BELOW_RUNS = {"training", "coding", "evaluation", "rendering", "gaussians", "scene", "plugins"}
 ROOMS = {
     "plugins": set(),

@@ -11,12 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import Field
 
+from splatwizard_core.base.values import parse_text
 from splatwizard_core.errors import ConfigError, PluginError
 from splatwizard_core.method import Method, create_method
 from splatwizard_core.plugins.registry import Registry
 from splatwizard_core.runs.config import apply_overrides, parse_set, rate_points, resolve
 from splatwizard_core.training.params import OptimizationParams, Params
-from splatwizard_core.training.values import parse_text
 
 
 class Densify(Params):

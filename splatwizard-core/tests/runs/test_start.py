@@ -14,6 +14,7 @@ import torch
 from sw_gaussians.ply import export_ply
 from sw_gaussians.start import gaussians_from_points
 
+from splatwizard_core.base.lock import directory_lock
 from splatwizard_core.cli.main import main
 from splatwizard_core.cli.setup import Choices
 from splatwizard_core.errors import CheckpointError, ConfigError, SplatwizardError, UserInputError
@@ -21,7 +22,6 @@ from splatwizard_core.plugins import PluginManager
 from splatwizard_core.runs.config import ResolvedConfig, parse_set, resolve
 from splatwizard_core.runs.directory import RunRequest
 from splatwizard_core.runs.identity import training_key
-from splatwizard_core.runs.lock import directory_lock
 from splatwizard_core.runs.pretrained import check_model, checked_start
 from splatwizard_core.runs.record import Record, missing_reasons
 from splatwizard_core.runs.run import run, train_only
@@ -100,7 +100,7 @@ def test_what_a_file_is_drawn_with_is_kept_where_nothing_is_trained(toy_plugins,
         trained, _ = Run(toy_plugins, tmp_path / "out" / str(len(sets)) / sets[0]).train(
             f"init={tmp_path / 'smooth.ply'}", *sets
         )
-        return trained.facts["raster"]
+        return trained.facts.raster
 
     assert asked("iterations=0") == {"antialias": True}
     assert asked("iterations=0", "raster.antialias=false") == {}
@@ -155,7 +155,7 @@ def test_the_preset_of_a_run_is_that_of_what_it_starts_from(toy_plugins, tmp_pat
     invocation = Run(toy_plugins, tmp_path)
     for preset, steps in (("quick", 6), ("paper", 8)):
         found = trained_scene(invocation.session, "toy", invocation.resolved(preset=preset), tmp_path)
-        assert found.facts["steps"] == steps
+        assert found.facts.steps == steps
 
 
 @pytest.mark.parametrize(
@@ -205,7 +205,7 @@ def test_rate_points_and_teachers_do_not_read_it_again(toy_plugins, tmp_path):
     second = trained_scene(invocation.session, "toy", invocation.resolved("iterations=3"), tmp_path)
     assert second is first
     other = trained_scene(invocation.session, "toy", invocation.resolved("pretrained.iterations=2"), tmp_path)
-    assert other.facts["steps"] == 2
+    assert other.facts.steps == 2
 
 
 def test_of_several_methods_those_that_start_from_nothing_leave_it_to_the_others(toy_plugins, tmp_path, ply, capsys):
@@ -251,8 +251,8 @@ def test_what_is_set_also_trains_what_a_method_starts_from(toy_plugins, tmp_path
 
 def test_a_teacher_is_trained_as_asked(toy_plugins, tmp_path):
     found, _ = Run(toy_plugins, tmp_path).train("pretrained.iterations=2", method="toy-pupil")
-    assert found.facts["pretraining"]["toy"]["steps"] == 2
-    assert [phase["phase"] for phase in found.facts["phases"]] == ["train: toy", "train: taught"]
+    assert found.facts.pretraining["toy"].steps == 2
+    assert [phase.phase for phase in found.facts.phases] == ["train: toy", "train: taught"]
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
@@ -294,7 +294,7 @@ def test_an_ordinary_run_takes_what_others_started_from(toy_plugins, tmp_path):
     assert not any(line.startswith("training toy on") for line in again.said)
     assert any("shares the training that others started from" in line for line in again.said)
     assert (directory / "log.jsonl").is_file()
-    assert found.facts["steps"] == 6
+    assert found.facts.steps == 6
 
 
 def test_a_finished_student_is_encoded_from_its_directory(toy_plugins, tmp_path, capsys):

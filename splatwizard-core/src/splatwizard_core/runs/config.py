@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard
 
+from splatwizard_core.base.toml_file import read_toml
 from splatwizard_core.errors import ConfigError, PluginError
 from splatwizard_core.evaluation.metrics import MetricSettings, check_settings
 from splatwizard_core.plugins.manager import PluginManager, load_plugins
@@ -22,7 +23,6 @@ from splatwizard_core.training.identity import DEFAULTS, all_values, given_value
 from splatwizard_core.training.keys import block_keys, dotted, field_at, flatten, input_files, set_at, value_at
 from splatwizard_core.training.overrides import apply_overrides, unknown_key
 from splatwizard_core.training.params import OptimizationParams, Params, PipelineParams, SceneParams
-from splatwizard_core.training.toml_file import read_toml
 from splatwizard_native import file_sha256
 
 if TYPE_CHECKING:

@@ -15,6 +15,7 @@ from splatwizard_core.plugins import PluginManager
 from splatwizard_core.plugins.catalogue import package_of
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.runs.config import ResolvedConfig
+from splatwizard_core.runs.facts import TrainingFacts
 from splatwizard_core.scene.digest import scene_digest
 from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.scene.scene import Scene
@@ -31,7 +32,7 @@ class TrainedModel:
 
     model: SplatModel
     key: str
-    facts: dict[str, Any]
+    facts: TrainingFacts
 
 
 @dataclass

@@ -5,13 +5,22 @@ from __future__ import annotations
 import contextlib
 import enum
 import json
+import types
 import typing
 from collections.abc import Callable, Mapping
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, Union
 
 from pydantic import BaseModel, TypeAdapter
 
-from splatwizard_core.training.keys import members
+
+def members(annotation: Any) -> list[Any]:
+    """Return the alternatives of a union (NoneType among them), or the one type, without Annotated[...] around it."""
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is Annotated:
+        return members(arguments[0])
+    if origin in (Union, types.UnionType):
+        return [member for argument in arguments for member in members(argument)]
+    return [annotation]
 
 
 def parse_text(annotation: Any, text: str) -> Any:

@@ -4,9 +4,9 @@ import os
 
 import pytest
 
+from splatwizard_core.base import toml_file
+from splatwizard_core.base.toml_file import MAX_BYTES, MAX_PARTS, read_toml
 from splatwizard_core.errors import ConfigError
-from splatwizard_core.training import toml_file
-from splatwizard_core.training.toml_file import MAX_BYTES, MAX_PARTS, read_toml
 
 QUOTED = '"\\"".' * 40_000
 
