@@ -96,9 +96,10 @@ def train_with_digests() -> None:
 
     def run_with_digests(trainer: Any, until: int, after_step: Callable[[Any], None]) -> None:
         def after(record: Any) -> None:
-            if trainer.step % int(every) == 0 or trainer.step == trainer.stage.iterations:
-                tensors = {name: digest_of(tensor) for name, tensor in trainer.model.state_dict().items()}
-                line = {"stage": trainer.index, "step": trainer.step, "tensors": tensors}
+            state = trainer.state
+            if state.step % int(every) == 0 or state.finished:
+                tensors = {name: digest_of(tensor) for name, tensor in state.model.state_dict().items()}
+                line = {"stage": state.index, "step": state.step, "tensors": tensors}
                 with Path(path).open("a") as file:
                     file.write(json.dumps(line) + "\n")
             after_step(record)
@@ -213,6 +214,7 @@ class Training:
         from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
         from splatwizard_core.training.rng import Streams
         from splatwizard_core.training.stage import StageContext
+        from splatwizard_core.training.state import TrainingState
         from splatwizard_core.training.trainer import Trainer
 
         with self.order():
@@ -229,20 +231,20 @@ class Training:
                     model = method.create_model(self.scene, streams("init")).to(self.session.device).train()
                 context = StageContext(model, self.scene, resolved.ppl, rasterizer, streams, self.trained)
                 model = stage.begin(context)
-                trainer = Trainer(stage, model, self.scene, resolved.ppl, rasterizer, streams)
-            while trainer.step < stage.iterations and not trainer.stopped:
-                before = trainer.step
+                trainer = Trainer(TrainingState.begin(stage, model, self.scene, resolved.ppl, rasterizer, streams))
+            while trainer.state.step < stage.iterations and not trainer.state.stopped:
+                before = trainer.state.step
                 with self.order():
                     synchronize()
                     began = time.perf_counter()
                     trainer.run(min(before + self.args.turn, stage.iterations), lambda _: None)
                     synchronize()
                 taken = time.perf_counter() - began
-                self.seconds, self.steps = self.seconds + taken, self.steps + trainer.step - before
-                self.turns.append(taken / max(trainer.step - before, 1))
+                self.seconds, self.steps = self.seconds + taken, self.steps + trainer.state.step - before
+                self.turns.append(taken / max(trainer.state.step - before, 1))
                 yield
             with self.order():
-                model = stage.finish(trainer.model, self.scene)
+                model = stage.finish(trainer.state.model, self.scene)
         self.model = model
 
 

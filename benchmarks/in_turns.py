@@ -98,13 +98,14 @@ def train_in_slices() -> None:
             halted = True
             os.kill(os.getpid(), signal.SIGSTOP)
         run(trainer, *args, **kwargs)
-        if trainer.step < trainer.stage.iterations and not trainer.stopped:
+        state = getattr(trainer, "state", trainer)  # before 0.3 the trainer had it all
+        if state.step < state.stage.iterations and not state.stopped:
             return
         import torch
 
         if torch.cuda.is_available():
             torch.cuda.synchronize()
-        end = {"at": time.monotonic(), "steps": trainer.step, "rows": trainer.model.num_rows}
+        end = {"at": time.monotonic(), "steps": state.step, "rows": state.model.num_rows}
         os.write(int(os.environ[REPORT]), json.dumps(end).encode())
         os._exit(0)  # no checkpoint is written while another version trains
 

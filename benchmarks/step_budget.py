@@ -37,6 +37,7 @@ from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.rng import Streams
 from splatwizard_core.training.stage import StageContext
+from splatwizard_core.training.state import TrainingState
 from splatwizard_core.training.trainer import Trainer
 from splatwizard_native import seeded
 from sw_3dgs.config import ThreeDGSConfig
@@ -100,7 +101,7 @@ def trainer_of(variant: str, model: GaussianModel, scene: Scene, device: str) ->
     rasterizer = NegotiatedRasterizer(load_plugins(), device=device)
     copy = GaussianModel.from_tensors(*(getattr(model, name).detach() for name in TENSORS)).to(device)
     context = StageContext(copy, scene, ppl, rasterizer, streams, lambda name: copy)
-    return Trainer(stage, stage.begin(context), scene, ppl, rasterizer, streams)
+    return Trainer(TrainingState.begin(stage, stage.begin(context), scene, ppl, rasterizer, streams))
 
 
 def wait(device: str) -> None:
@@ -112,7 +113,7 @@ def wall(trainer: Trainer, steps: int, device: str) -> float:
     """Milliseconds a step."""
     wait(device)
     since = time.perf_counter()
-    trainer.run(trainer.step + steps, lambda record: None)
+    trainer.run(trainer.state.step + steps, lambda record: None)
     wait(device)
     return 1e3 * (time.perf_counter() - since) / steps
 
@@ -121,7 +122,7 @@ def watched(trainer: Trainer, steps: int) -> tuple[dict[str, float], float, floa
     """Milliseconds a step of each phase, launches a step, and milliseconds a step in which the host waited."""
     activities = [ProfilerActivity.CPU, ProfilerActivity.CUDA]
     with profile(activities=activities) as found:
-        trainer.run(trainer.step + steps, lambda record: None)
+        trainer.run(trainer.state.step + steps, lambda record: None)
         torch.cuda.synchronize()
     phases: dict[str, float] = defaultdict(float)
     launches, waited = 0, 0.0

@@ -137,13 +137,15 @@ def trained(job: Job) -> dict[str, Any]:
         ).train()  # fmt: skip
         lines = [json.loads(line) for line in log.read_text("utf-8").splitlines()]
     return {
-        "steps": outcome.steps,
-        "seconds": outcome.train_s,
+        "steps": outcome.figures.steps,
+        "seconds": outcome.figures.train_s,
         "cpu_seconds": time.process_time() - began - aside,
         **measure(outcome.model),
         "gaussians": outcome.model.num_rows,
-        "peak_mib": outcome.peak_memory / MIB,
-        "growth": [line["num_gaussians"] for line in lines if "num_gaussians" in line][:: max(1, outcome.steps // 200)],
+        "peak_mib": (outcome.figures.peak_bytes or 0) / MIB,
+        "growth": [line["num_gaussians"] for line in lines if "num_gaussians" in line][
+            :: max(1, outcome.figures.steps // 200)
+        ],
         "curve": [[line["step"], line["train_s"], line["metrics"]["psnr"]] for line in lines if "metrics" in line],
     }
 

@@ -63,6 +63,7 @@ from splatwizard_core.scene.scene import Scene
 from splatwizard_core.streams import stream
 from splatwizard_core.training.rng import Streams
 from splatwizard_core.training.stage import StageContext
+from splatwizard_core.training.state import TrainingState
 from splatwizard_core.training.trainer import StepRecord, Trainer
 from splatwizard_native import seeded, work_time
 from sw_cat_3dgs.fast import plane_kernels, plane_sites
@@ -282,21 +283,21 @@ def anchors(
     with seeded(args.seed):
         model = made.create_model(scene, stream(args.seed, "init")).to(session.device)
         trainer = trainer_of(made.stages()[0], model, scene, resolved.ppl, rasterizer)
-        phases = phases_of(method, trainer.stage)
+        phases = phases_of(method, trainer.state.stage)
         phases[-1].end = last
         if args.last:
             phases = phases[-1:]
         watch = Watch(session.device, phases, args.window, args.syncs, args.kernels, args.brief)
         drawn: list[Any] = []
-        render = trainer.rasterizer.render
+        render = trainer.state.rasterizer.render
 
         def counted(*call: Any) -> Any:
             result = render(*call)
-            if trainer.step >= last - 20:
+            if trainer.state.step >= last - 20:
                 drawn.append((result.radii > 0).sum())
             return result
 
-        object.__setattr__(trainer.rasterizer, "render", counted)
+        object.__setattr__(trainer.state.rasterizer, "render", counted)
         if not args.brief:  # the marks take time
             mark_parts(trainer)
 
@@ -309,9 +310,11 @@ def anchors(
 
         with_pictures(scene, session.device, run)
     count = round(sum(int(d) for d in drawn) / max(len(drawn), 1))
-    print(f"  {method}, {last:,} steps of preset {args.preset}, {trainer.model.num_rows:,} anchors, {count:,} drawn")
+    print(
+        f"  {method}, {last:,} steps of preset {args.preset}, {trainer.state.model.num_rows:,} anchors, {count:,} drawn"
+    )
     peak = math.nan
-    cuda, prepared = session.device.type == "cuda", getattr(trainer.model, "fixed", None)
+    cuda, prepared = session.device.type == "cuda", getattr(trainer.state.model, "fixed", None)
     if cuda:
         said = f"{prepared.captures} captures" if prepared is not None else "off"
         peak = torch.cuda.max_memory_allocated() / 1e9
@@ -324,10 +327,12 @@ def anchors(
         print(f"    {phase.name:20} steps {phase.start + 1:,} to {phase.end:,}: {phase.rate:7.1f} it/s{used}")
         if phase.lines:
             print("\n".join(phase.lines), flush=True)
-    found = Summary(method, phases[-1].rate, phases[-1].settled, phases[-1].busy, peak, loss, trainer.model.num_rows)
+    found = Summary(
+        method, phases[-1].rate, phases[-1].settled, phases[-1].busy, peak, loss, trainer.state.model.num_rows
+    )
     if args.baseline_steps < 1:
         return found
-    rate, drawn_there = explicit(trainer.model, count, args, session, scene, folder)
+    rate, drawn_there = explicit(trainer.state.model, count, args, session, scene, folder)
     print(f"    3DGS drawing {drawn_there:,} Gaussians a view: {rate:.1f} it/s", flush=True)
     return found
 
@@ -340,7 +345,7 @@ def trainer_of(stage: Any, model: Any, scene: Scene, ppl: Any, rasterizer: Any) 
         raise AssertionError(f"starts from no {name}")
 
     model = stage.begin(StageContext(model, scene, ppl, rasterizer, streams, none))
-    return Trainer(stage, model, scene, ppl, rasterizer, streams)
+    return Trainer(TrainingState.begin(stage, model, scene, ppl, rasterizer, streams))
 
 
 def with_pictures(scene: Scene, device: torch.device, run: Callable[[], None]) -> None:

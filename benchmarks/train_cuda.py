@@ -166,7 +166,12 @@ def ours(folder: str, pictures: str | None, args: argparse.Namespace, watch: Wat
     )
     psnr = result.metrics["psnr"].mean
     assert psnr is not None
-    return Figures(outcome.steps / outcome.train_s, psnr, outcome.model.num_rows, outcome.peak_memory / MIB)
+    return Figures(
+        outcome.figures.steps / outcome.figures.train_s,
+        psnr,
+        outcome.model.num_rows,
+        (outcome.figures.peak_bytes or 0) / MIB,
+    )
 
 
 def _no_other(name: str) -> Any:

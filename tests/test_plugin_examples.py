@@ -9,6 +9,7 @@ import os
 import re
 import sys
 from collections.abc import Iterator
+from copy import copy
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -236,7 +237,7 @@ def test_register_methods(plugins, scene, tmp_path):
     trained.requires_grad_(False)
     path = tmp_path / "scene.swz"
     facts = encode(method, trained, {}, path)
-    assert ("coder", "gaussians-exact") in [(part["kind"], part["name"]) for part in facts["parts"]]
+    assert ("coder", "gaussians-exact") in [(part.kind, part.name) for part in facts.parts]
     decoded, reader = open_model(path, plugins, CPU)
     assert reader.method == "their-method"
     assert torch.equal(decoded.sh_dc, trained.sh_dc)
@@ -259,7 +260,7 @@ def test_a_stage(site, scene, model):
     assert shorter.when(range(500, 15_000, 100)) == range(5, 150, 1)
     seen = []
     before = model.means.detach().clone()
-    trained = train_with([stage], lambda: model, scene, lambda _, record: seen.append(record))
+    trained = train_with([stage], lambda: model, scene, lambda _, state: seen.append(copy(state)))
     assert [record.step for record in seen] == [1, 2]
     assert seen[0].parts.keys() == {"l1", "ssim", "opacity"}
     expected = 0.8 * seen[0].parts["l1"] + 0.2 * (1 - seen[0].parts["ssim"]) + 0.5 * seen[0].parts["opacity"]

@@ -22,6 +22,7 @@ from splatwizard_core.streams import stream
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.rng import Streams
 from splatwizard_core.training.stage import StageContext
+from splatwizard_core.training.state import TrainingState
 from splatwizard_core.training.trainer import CHECK_EVERY, Trainer
 from splatwizard_native import seeded
 from splatwizard_native.fused.native import TRAINING
@@ -55,7 +56,7 @@ def make_trainer(scene: Scene, config: ThreeDGSConfig | None = None, **settings)
     model = stage.begin(
         StageContext(gaussians_from_points(scene.points).cuda(), scene, ppl, rasterizer, streams, lambda name: None)
     )
-    return Trainer(stage, model, scene, ppl, rasterizer, streams)
+    return Trainer(TrainingState.begin(stage, model, scene, ppl, rasterizer, streams))
 
 
 @pytest.mark.parametrize("channels", [3, 4])
@@ -85,18 +86,18 @@ def test_nor_does_it_with_noise_sparse_updates_or_opacity_gradients(settings):
 
 
 def waits_for_nothing(trainer: Trainer) -> None:
-    records = []
-    trainer.run(2 * CHECK_EVERY, records.append)
+    losses = []
+    trainer.run(2 * CHECK_EVERY, lambda state: losses.append(state.total))
     torch.cuda.set_sync_debug_mode("error")
     try:
-        while trainer.step < 4 * CHECK_EVERY:  # verdicts on the losses are among them
-            trainer.step += 1
-            records.append(trainer._run_step(trainer.step))
+        while trainer.state.step < 4 * CHECK_EVERY:  # verdicts on the losses are among them
+            trainer.run_step()
+            losses.append(trainer.state.total)
     finally:
         torch.cuda.set_sync_debug_mode("default")
     trainer.check_losses()
-    assert all(math.isfinite(record.total.item()) for record in records)
-    assert trainer.optimizer.moments("means")[2] == 4 * CHECK_EVERY  # every step has updated
+    assert all(math.isfinite(loss.item()) for loss in losses)
+    assert trainer.state.optimizer.moments("means")[2] == 4 * CHECK_EVERY  # every step has updated
 
 
 DENSE = {"densify": {"start": 60, "interval": 40, "grad_threshold": 5e-5, "reset_interval": 150}, "iterations": 7000}
@@ -123,7 +124,9 @@ def test_two_deterministic_trainings_give_the_same_bits(values):
         with seeded(0, deterministic=True):
             trainer = make_trainer(small_scene(3), config, deterministic=True)
             trainer.run(250, lambda record, losses=losses: losses.append(record.total))
-        outcomes.append((torch.stack(losses), dict(trainer.model.named_parameters()), trainer.optimizer.states))
+        outcomes.append(
+            (torch.stack(losses), dict(trainer.state.model.named_parameters()), trainer.state.optimizer.states)
+        )
     (losses, parameters, states), (others, theirs, other_states) = outcomes
     assert torch.equal(losses, others)
     assert len(parameters["means"]) != 500  # densification took part
@@ -148,7 +151,7 @@ def test_updates_in_the_backward_pass_are_those_of_the_optimizer(values, monkeyp
     for fuses in (False, True):
         with seeded(0, deterministic=True):
             trainer = make_trainer(small_scene(3), config, deterministic=True)
-            trainer.stage.fuses_updates = fuses
+            trainer.state.stage.fuses_updates = fuses
             trainer.run(50, lambda record: None)
         outcomes.append(trainer)
         assert sum(fused) == (49 if fuses else 0)  # the moments exist from the first update on
@@ -166,8 +169,8 @@ def test_mcmc_grows_to_its_cap_with_what_it_draws_on_the_cpu():
     chain = MCMC(enabled=True, start=20, interval=20, cap=600)
     trainer = make_trainer(small_scene(3), ThreeDGSConfig(iterations=200, mcmc=chain))
     trainer.run(200, lambda record: None)
-    assert trainer.model.num_rows == 600
-    assert all(torch.isfinite(p).all() for p in trainer.model.parameters())
+    assert trainer.state.model.num_rows == 600
+    assert all(torch.isfinite(p).all() for p in trainer.state.model.parameters())
     weights = torch.rand(5000, generator=torch.Generator().manual_seed(1))
     drawn = [draw(weights.to(device), 300, stream(1, "draw")).cpu() for device in ("cpu", "cuda")]
     assert torch.equal(*drawn)

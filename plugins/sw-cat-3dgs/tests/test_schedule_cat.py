@@ -165,6 +165,7 @@ def test_each_phase_trains_what_the_table_says(scene, rasterizer, method, offici
     """A run of 400 steps: published step / 100; growth is off, so that rows stay."""
     from splatwizard_core.streams import stream
     from splatwizard_core.training.rng import Streams
+    from splatwizard_core.training.state import TrainingState
     from splatwizard_core.training.trainer import Trainer
 
     made = method(
@@ -180,7 +181,7 @@ def test_each_phase_trains_what_the_table_says(scene, rasterizer, method, offici
         generator = staticmethod(streams)
 
     Context.model, Context.scene = model, scene
-    trainer = Trainer(stage, stage.begin(Context), scene, PipelineParams(), rasterizer, streams)
+    trainer = Trainer(TrainingState.begin(stage, stage.begin(Context), scene, PipelineParams(), rasterizer, streams))
     phases, watched = {}, {round(s / 100 + (s % 100 > 0) * 0): s for s in AFTER if s % 100 == 0}
     watched |= {99: 9_999, 101: 10_001, 149: 14_999}
     state = {"before": digests(model)}

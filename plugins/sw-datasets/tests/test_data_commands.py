@@ -327,7 +327,7 @@ def test_a_scene_that_lacks_something_is_not_written_over(data: Path, site: Site
 
 
 def test_two_fetches_at_once_are_kept_apart(data: Path, site: Site, capsys):
-    from splatwizard_core.runs.lock import directory_lock
+    from splatwizard_core.base.lock import directory_lock
 
     with directory_lock(data / ".downloads"):
         assert main(["data", "fetch", "lab", "-y"]) == 2

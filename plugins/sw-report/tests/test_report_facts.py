@@ -22,7 +22,7 @@ def test_a_record_of_today_is_read_without_remark(make_run):
     assert (facts.method, facts.rate, facts.scene, facts.file.bytes) == ("toy", "r3", "garden", 5000)
     assert facts.train.steps == 300
     assert facts.speed.fps == 12.5
-    assert facts.protocol.rules()["resolution"] == -1
+    assert facts.rules()["resolution"] == -1
 
 
 def test_an_older_record_is_read_and_its_schema_told(make_run):

@@ -360,7 +360,7 @@ def test_what_a_training_started_from_is_said(make_run, tmp_path):
              "made_by": {}}  # fmt: skip
     for rate, scene in (("r1", trained), ("r2", given)):
         make_run(rate, change=lambda content, scene=scene: content["train"].update(pretraining={"3dgs": scene}))
-    told = {run.facts.rate: run.facts.train.started_from() for run in collect([tmp_path]).runs}
+    told = {run.facts.rate: run.facts.started_from() for run in collect([tmp_path]).runs}
     assert told["r1"] == "a trained 3dgs scene (quick preset, 2,000 steps, 45.0 s)"
     assert told["r2"] == "a trained 3dgs scene from the file a.ply"
 

@@ -42,7 +42,7 @@ def run(method: str, scene: str | None = None, out: str | Path = "out", **option
 def train(method: str, scene: str | None = None, out: str | Path = "out", **options: Any) -> tuple[Opened, Path]:
     """Train, or load what is trained; returns the model with what it asks of a rasterizer, and the run directory."""
     trained, directory = train_only(*_training(method, scene, out, options))
-    return Opened(trained.model.eval().requires_grad_(False), trained.facts["raster"]), directory
+    return Opened(trained.model.eval().requires_grad_(False), trained.facts.raster), directory
 
 
 def encode(directory: str | Path, file: str | Path, **options: Any) -> Path:
@@ -73,7 +73,7 @@ def evaluate(source: Opened | str | Path, scene: str | None = None, *, speed: bo
     resolved = (chosen if isinstance(source, Opened) else chosen.of_file(Path(source))).resolve_without_method()
     session = tooling.open_session(resolved, tooling.load_plugins())
     open_it = (lambda: source) if isinstance(source, Opened) else opener(Path(source), session)
-    return measure(session, resolved, open_it, speed=speed)
+    return measure(session, resolved, open_it, speed=speed).model_dump(mode="json")
 
 
 def render(opened: Opened, view: api.View, **options: Any) -> api.RenderResult:

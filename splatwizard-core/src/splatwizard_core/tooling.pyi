@@ -1,3 +1,5 @@
+from splatwizard_core.base.lock import directory_lock as directory_lock
+from splatwizard_core.base.toml_file import read_toml as read_toml
 from splatwizard_core.cli.complete import SCENE as SCENE
 from splatwizard_core.cli.complete import name_of as name_of
 from splatwizard_core.cli.options import config_option as config_option
@@ -56,7 +58,6 @@ from splatwizard_core.runs.directory import OWN_FILES as OWN_FILES
 from splatwizard_core.runs.directory import RunRequest as RunRequest
 from splatwizard_core.runs.directory import run_directory as run_directory
 from splatwizard_core.runs.identity import recorded_hash as recorded_hash
-from splatwizard_core.runs.lock import directory_lock as directory_lock
 from splatwizard_core.runs.measure import open_subject as open_subject
 from splatwizard_core.runs.observers import FinishedRun as FinishedRun
 from splatwizard_core.runs.observers import FinishedRuns as FinishedRuns
@@ -64,7 +65,6 @@ from splatwizard_core.runs.observers import StartedTraining as StartedTraining
 from splatwizard_core.runs.observers import TrainingObserver as TrainingObserver
 from splatwizard_core.runs.pretrained import base_config as base_config
 from splatwizard_core.runs.pretrained import first_scene as first_scene
-from splatwizard_core.runs.pretrained import for_starts as for_starts
 from splatwizard_core.runs.pretrained import make_method as make_method
 from splatwizard_core.runs.pretrained import named_scenes as named_scenes
 from splatwizard_core.runs.pretrained import useful_starts as useful_starts
@@ -78,11 +78,12 @@ from splatwizard_core.runs.session import Session as Session
 from splatwizard_core.runs.training import cached_directory as cached_directory
 from splatwizard_core.scene.loading import load_scene as load_scene
 from splatwizard_core.scene.locate import DATA_VARIABLE as DATA_VARIABLE
+from splatwizard_core.training.figures import Shown as Shown
 from splatwizard_core.training.params import SceneParams as SceneParams
 from splatwizard_core.training.pipeline import TrainingRun as TrainingRun
 from splatwizard_core.training.pipeline import TrainingStopped as TrainingStopped
 from splatwizard_core.training.scheduler import build_schedulers as build_schedulers
-from splatwizard_core.training.toml_file import read_toml as read_toml
+from splatwizard_core.training.state import TrainingState as TrainingState
 from splatwizard_native.files import bytes_with_named as bytes_with_named
 from splatwizard_native.files import file_sha256 as file_sha256
 from splatwizard_native.files import new_folder as new_folder

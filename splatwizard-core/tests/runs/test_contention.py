@@ -5,8 +5,13 @@ from __future__ import annotations
 import pytest
 
 from splatwizard_core.runs import fresh
-from splatwizard_core.runs.contention import contended_phases, contention
+from splatwizard_core.runs.facts import contention
 from splatwizard_native import CoreTime, core_time
+
+DECODED = {
+    "method": "toy", "method_version": 1, "digest": "ab", "counts": {}, "bytes": 1, "sections": {"header": 1},
+    "decode_s": 1.0, "peak_bytes": 1, "memory_kind": "rss",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(("waited", "told"), [(0, {}), (3 * 10**12, {"train": 0.25})])
@@ -16,14 +21,9 @@ def test_a_phase_is_told_if_its_threads_had_to_wait(monkeypatch, waited, told):
     assert contention("train", CoreTime()) == told
 
 
-def test_the_phases_of_all_steps_come_together_older_steps_noted_none():
-    training, encoding, decoded = {"contended": {"train": 0.5}}, {"encode_s": 1.0}, {"contended": {}}
-    assert contended_phases(training, encoding, decoded) == {"train": 0.5}
-
-
 def test_the_decoding_process_gets_the_number_of_threads(monkeypatch, tmp_path):
     asked = []
-    monkeypatch.setattr(fresh, "run_fresh", lambda arguments, **_: asked.append(list(arguments)) or {})
+    monkeypatch.setattr(fresh, "run_fresh", lambda arguments, **_: asked.append(list(arguments)) or DECODED)
     (tmp_path / "a.swz").write_bytes(b"x")
     fresh.decode_fresh(tmp_path / "a.swz", "cpu", threads=3)
     assert asked[0][:2] == ["decode", "a.swz"]

@@ -21,6 +21,7 @@ from splatwizard_core.runs import run as run_module
 from splatwizard_core.runs.config import parse_set, resolve
 from splatwizard_core.runs.decode import open_model
 from splatwizard_core.runs.directory import RunRequest
+from splatwizard_core.runs.facts import DecodingFacts
 from splatwizard_core.runs.run import run, train_only
 from splatwizard_core.runs.session import Session
 from splatwizard_core.scene.scene import PointCloud
@@ -86,8 +87,9 @@ def here(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) ->
         told: dict[str, Any] = json.loads(capsys.readouterr().out)
         return told
 
-    def decode(path: Path, device: str, *, repeats: int, threads: int) -> dict[str, Any]:
-        return in_this_process(["decode", str(path), "--device", device, "--repeats", str(repeats), "--json"])
+    def decode(path: Path, device: str, *, repeats: int, threads: int) -> DecodingFacts:
+        told = in_this_process(["decode", str(path), "--device", device, "--repeats", str(repeats), "--json"])
+        return DecodingFacts.model_validate(told)
 
     monkeypatch.setattr(run_module, "run_fresh", in_this_process)
     monkeypatch.setattr(run_module, "decode_fresh", decode)

@@ -8,12 +8,12 @@ import pytest
 import torch
 from pydantic import create_model
 
+from splatwizard_core.base.lock import directory_lock
 from splatwizard_core.errors import CheckpointError
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.runs.config import ResolvedConfig, parse_set, resolve
 from splatwizard_core.runs.directory import CHECKPOINTS, STEPS, RunRequest
 from splatwizard_core.runs.identity import key_when_made
-from splatwizard_core.runs.lock import directory_lock
 from splatwizard_core.runs.pretrained import base_config
 from splatwizard_core.runs.run import train_only
 from splatwizard_core.runs.session import Session
@@ -140,7 +140,7 @@ def test_a_scene_that_an_older_release_began_is_gone_on_with(toy_plugins: Plugin
     again = Command(toy_plugins, tmp_path)
     found = trained_scene(again.session, "toy", again.resolved(), tmp_path)
     assert any("is not finished yet: going on with it first" in line for line in again.said)
-    assert found.facts["steps"] == 6
+    assert found.facts.steps == 6
     assert list((tmp_path / CACHE).iterdir()) == [folder]
 
 

@@ -13,9 +13,10 @@ from splatwizard_core.plugins import Entry, PluginManager
 from splatwizard_core.rendering.info import RasterizerInfo
 from splatwizard_core.runs.config import parse_set, resolve
 from splatwizard_core.runs.directory import RunRequest
+from splatwizard_core.runs.facts import Extent
 from splatwizard_core.runs.measure import Opened, measure
 from splatwizard_core.runs.record import Record, missing_reasons
-from splatwizard_core.runs.run import measures, run
+from splatwizard_core.runs.run import run
 from splatwizard_core.runs.session import Session
 
 pytestmark = pytest.mark.pipeline
@@ -112,9 +113,9 @@ def test_a_file_that_prefers_other_kernels_is_timed_with_the_default_ones_too(
     def open_model() -> Opened:
         return Opened(model.eval().requires_grad_(False), {"prefer": ["own"]})
 
-    speed = measure(session, resolved, open_model, metrics=["psnr"])["speed"]
-    assert speed["drawn_by"] == {"own": kernels or "own"}
-    assert list(speed.get("default_fps", {})) == (["reference"] if others else [])
+    speed = measure(session, resolved, open_model, metrics=["psnr"]).speed
+    assert speed.drawn_by == {"own": kernels or "own"}
+    assert list(speed.default_fps) == (["reference"] if others else [])
 
 
 def test_only_quick_metrics_are_computed_on_the_way(runs, tmp_path_factory):
@@ -128,17 +129,16 @@ def test_only_quick_metrics_are_computed_on_the_way(runs, tmp_path_factory):
 
 
 def test_an_earlier_measurement_counts_if_it_holds_all_that_is_asked():
-    asked = {"repeats": 2, "metrics": {"psnr": "core 1", "lpips_vgg": None}, "eval_train": False}
-    held = {"repeats": 3, "metrics": {"psnr": "core 1", "lpips_vgg": "weights a"}, "eval_train": True}
-    assert measures(held, asked)
-    assert not measures(asked, {**asked, "eval_train": True})
-    assert not measures({"repeats": 3, "metrics": held["metrics"]}, held)  # of a release that did not draw them
-    assert measures(asked, asked)
-    assert not measures({**held, "repeats": 1}, asked)
-    assert not measures({**held, "metrics": {"psnr": "core 0"}}, asked)
-    assert not measures(held, {**asked, "metrics": {"lpips_vgg": "weights b"}})
-    for damaged in (None, [], {}, {"repeats": "3", "metrics": {}}, {"repeats": 3, "metrics": None}):
-        assert not measures(damaged, asked)
+    asked = Extent(repeats=2, metrics={"psnr": "core 1", "lpips_vgg": None})
+    held = Extent(repeats=3, metrics={"psnr": "core 1", "lpips_vgg": "weights a"}, eval_train=True)
+    assert held.holds(asked)
+    assert asked.holds(asked)
+    assert not asked.holds(asked.model_copy(update={"eval_train": True}))
+    undrawn = Extent.model_validate({"repeats": 3, "metrics": held.metrics})  # of a release that drew no training views
+    assert not undrawn.holds(held)
+    for change, wanted in (({"repeats": 1}, {}), ({"metrics": {"psnr": "core 0"}}, {}),
+                           ({}, {"metrics": {"lpips_vgg": "weights b"}})):  # fmt: skip
+        assert not held.model_copy(update=change).holds(asked.model_copy(update=wanted))
 
 
 def test_the_record_names_no_folder_of_this_machine(runs):

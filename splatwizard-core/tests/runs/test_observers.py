@@ -65,7 +65,7 @@ def test_an_interrupted_training_is_finished_for_its_observer(helped_plugins, wa
 def test_an_observer_that_raises_is_told_with_its_package_and_dropped(helped_plugins, watched, tmp_path, monkeypatch):
     monkeypatch.setattr(watched, "FAILS_AT", 3)
     run = Run(helped_plugins, tmp_path)
-    assert run.train().facts["steps"] == 6
+    assert run.train().facts.steps == 6
     assert watched.NOTES[-2:] == ["step 2 of 60", "finished"]
     warnings = [line for line in run.said if line.startswith("warning")]
     assert warnings == ["warning: observer Watcher of sw-helper 0.7 is dropped: OSError: no screen"]

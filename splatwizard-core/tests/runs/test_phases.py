@@ -7,13 +7,15 @@ from pathlib import Path
 import pytest
 import torch
 
+from splatwizard_core.base.lock import directory_lock
 from splatwizard_core.cli.main import main
 from splatwizard_core.errors import BitstreamError
 from splatwizard_core.plugins.origins import Origins
 from splatwizard_core.runs.config import parse_set, resolve
 from splatwizard_core.runs.directory import RunRequest, run_directory
-from splatwizard_core.runs.lock import directory_lock
+from splatwizard_core.runs.facts import EncodingFacts, Measurement, TrainingFacts
 from splatwizard_core.runs.phases import named_parts, part_of, phases_of_run
+from splatwizard_core.runs.record import MetricBlock
 from splatwizard_core.runs.run import run, train_in
 from splatwizard_core.runs.session import Session
 from splatwizard_core.training.stage import Stage
@@ -78,7 +80,7 @@ def test_a_resumed_training_names_what_served_before(helped_plugins, tmp_path, e
         train_in(session(helped_plugins), request, directory, stop_after=stop)
     with directory_lock(directory):
         facts = train_in(session(helped_plugins), request, directory).facts
-    assert told(facts["phases"]) == {name: expected[name] for name in ("train: toy", "train: second")}
+    assert told(facts.model_dump()["phases"]) == {name: expected[name] for name in ("train: toy", "train: second")}
 
 
 def test_what_a_scene_that_is_started_from_asks_for_is_not_told_of_the_stage(helped_plugins, tmp_path):
@@ -86,21 +88,26 @@ def test_what_a_scene_that_is_started_from_asks_for_is_not_told_of_the_stage(hel
     directory = run_directory(request)
     with directory_lock(directory):
         facts = train_in(session(helped_plugins), request, directory).facts
-    assert [phase["phase"] for phase in facts["phases"]] == ["train: student"]
-    assert [part["kind"] for part in facts["phases"][0]["provided_by"]] == ["stage", "rasterizer"]
+    assert [phase.phase for phase in facts.phases] == ["train: student"]
+    assert [part.kind for part in facts.phases[0].provided_by] == ["stage", "rasterizer"]
 
 
 def test_a_metric_without_a_value_served_nothing(helped_plugins):
     metrics = {
-        name: {"per_view": values, "mean": mean}
+        name: MetricBlock(per_view=values, mean=mean)
         for name, values, mean in (
             ("psnr", [30.0], 30.0), ("l1", [], None), ("gone", [1.0], None), ("mesh", [], 0.01),
         )
     }  # fmt: skip
-    phases = phases_of_run(helped_plugins, {"phases": []}, {"parts": []}, {"rasterizers": {}, "metrics": metrics})
+    phases = phases_of_run(
+        helped_plugins,
+        TrainingFacts(),
+        EncodingFacts(encode_s=0.0, bytes=1, sha256=""),
+        Measurement.model_construct(rasterizers={}, metrics=metrics),
+    )
     psnr = helped_plugins.metrics.entry("psnr")
     assert psnr.distribution == CORE[0]
-    assert told(phases)["evaluate"] == [
+    assert told([phase.model_dump() for phase in phases])["evaluate"] == [
         ("metric", "psnr", psnr.distribution, psnr.version), ("metric", "gone", "", ""), ("metric", "mesh", "", ""),
     ]  # fmt: skip
     assert named_parts(helped_plugins, "metric", ["psnr", "psnr"]) == [part_of(psnr)]

@@ -10,12 +10,9 @@ from pydantic import ValidationError
 from splatwizard_core.cli.main import main
 from splatwizard_core.errors import SplatwizardError, UserInputError
 from splatwizard_core.runs.record import (
-    MemoryBlock,
     Record,
-    SpeedBlock,
     complete_record,
     missing_reasons,
-    picked,
     read_record,
 )
 
@@ -96,16 +93,16 @@ def test_info_shows_options_of_drawing_that_are_not_the_defaults(tmp_path: Path,
 def test_every_null_has_its_reason():
     assert missing_reasons(Record.model_validate(content())) == []
     without = Record.model_validate(content(unknown={"train.breakdown_s": "not profiled"}))
-    assert missing_reasons(without) == ["speed.spread", "memory.peak_reserved_bytes", "geometry", "training_psnr"]
+    nulls = {"speed.spread", "memory.peak_reserved_bytes", "geometry", "training_psnr"}
+    assert set(missing_reasons(without)) == nulls
 
 
 @pytest.mark.parametrize(
     "change",
     [
-        {"unheard_of": 1},
         {"visible_gaussians": float("nan")},
         {"file": {"bytes": 0, "sha256": "", "sections": {}, "digest": ""}},
-        {"metrics": {"psnr": {"mean": 1.0, "per_view": [], "direction": "up"}}},
+        {"metrics": {"psnr": {"mean": 1e308, "per_view": [], "direction": "higher"}}},
     ],
 )
 def test_what_is_not_in_the_schema_is_refused(change: dict[str, Any]):
@@ -153,13 +150,6 @@ def test_what_a_scene_was_trained_with_may_hold_null_and_what_is_unknown_of_it_n
     found = content()
     found["train"] = {**found["train"], "pretraining": {"3dgs": scene}}
     assert missing_reasons(Record.model_validate(found)) == ["train.pretraining.3dgs.preset"]
-
-
-def test_a_block_takes_its_fields_from_whoever_measured_them():
-    measured = picked(MemoryBlock, {"model_bytes": 1, "kind": "rss", "of no block": 2}, {"model_bytes": 3})
-    assert measured == {"kind": "rss", "model_bytes": 3, "peak_load_bytes": None, "peak_render_bytes": None}
-    required = {name for name, field in SpeedBlock.model_fields.items() if field.is_required()}
-    assert set(picked(SpeedBlock)) == required
 
 
 def test_nulls_get_the_reasons_of_their_fields_and_keep_better_ones():

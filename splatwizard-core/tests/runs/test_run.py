@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 
+from splatwizard_core.base.lock import directory_lock
 from splatwizard_core.cli.main import main
 from splatwizard_core.coding.container import ContainerReader
 from splatwizard_core.errors import CheckpointError, RunLockedError, SplatwizardError, UserInputError
@@ -15,8 +16,8 @@ from splatwizard_core.runs.config import ResolvedConfig, parse_set, resolve
 from splatwizard_core.runs.decode import open_model, save_decoded, timed_decode
 from splatwizard_core.runs.directory import RunRequest, run_directory
 from splatwizard_core.runs.encode import encode_directory
+from splatwizard_core.runs.facts import Measurement
 from splatwizard_core.runs.fresh import FreshProcessError, decode_fresh, run_fresh
-from splatwizard_core.runs.lock import directory_lock
 from splatwizard_core.runs.measure import measure, opener
 from splatwizard_core.runs.record import Record, read_record
 from splatwizard_core.runs.run import run, train_in, train_only
@@ -75,7 +76,7 @@ def test_the_record_holds_what_the_protocol_asks_for(done):
     assert set(record.rasterizers["train"]) == {"BACKWARD+SPLIT_SH"}
     assert record.raster_options == {"train": {}, "render": {}}
     assert record.environment["packages"]["sw-toy"] == "0.1"
-    assert record.plan[0]["iterations"] == 6
+    assert record.plan[0].iterations == 6
     for name in ("config.toml", "log.jsonl", "renders/view_000.png", "renders/view_004.png"):
         home = directory if name != "log.jsonl" else directory.parent / "r1"  # where it was trained
         assert (home / name).is_file()
@@ -85,20 +86,20 @@ def test_options_of_rasterizers_reach_training_the_file_and_what_measures_it(toy
     invocation, decided = Run(toy_plugins, tmp_path), ("raster.antialias=true", "raster.profile=dgr-exact")
     request = invocation.request(*decided, "iterations=1")
     trained, directory = train_only(invocation.session, request)
-    assert trained.facts["rasterizers"] == {"ANTIALIAS+BACKWARD+SPLIT_SH+profile dgr-exact": "reference"}
+    assert trained.facts.rasterizers == {"ANTIALIAS+BACKWARD+SPLIT_SH+profile dgr-exact": "reference"}
     encode_directory(invocation.session, request.resolved, directory, tmp_path / "x.swz")
     asked = {"antialias": True, "profile": "dgr-exact"}
-    assert trained.facts["raster"] == ContainerReader.open(tmp_path / "x.swz").raster == asked
+    assert trained.facts.raster == ContainerReader.open(tmp_path / "x.swz").raster == asked
 
-    def measured(*sets: str) -> dict[str, Any]:
+    def measured(*sets: str) -> Measurement:
         file = opener(tmp_path / "x.swz", invocation.session)
         return measure(invocation.session, config(toy_plugins, *sets), file, metrics=["psnr"], speed=False)
 
     as_file_asks, as_user_decides = measured(), measured("raster.antialias=false")
-    assert as_file_asks["raster"] == asked
-    assert as_file_asks["rasterizers"] == {"ANTIALIAS+SPLIT_SH+profile dgr-exact": "reference"}
-    assert as_user_decides["raster"] == {"profile": "dgr-exact"}
-    assert as_user_decides["metrics"]["psnr"]["mean"] != as_file_asks["metrics"]["psnr"]["mean"]
+    assert as_file_asks.raster == asked
+    assert as_file_asks.rasterizers == {"ANTIALIAS+SPLIT_SH+profile dgr-exact": "reference"}
+    assert as_user_decides.raster == {"profile": "dgr-exact"}
+    assert as_user_decides.metrics["psnr"].mean != as_file_asks.metrics["psnr"].mean
 
 
 def test_metrics_come_from_the_registry_and_a_missing_one_says_why(done):
@@ -175,7 +176,7 @@ def test_a_stopped_training_resumes_to_the_same_model(toy_plugins: PluginManager
     again = Run(toy_plugins, tmp_path / "stopped")
     resumed, _ = train_only(again.session, request)
     assert resumed.model.digest() == expected.model.digest()
-    assert resumed.facts["steps"] == 6
+    assert resumed.facts.steps == 6
 
 
 def test_a_method_that_changes_the_model_it_encodes_is_found_out(toy_plugins: PluginManager, tmp_path: Path):
@@ -214,7 +215,7 @@ def test_a_trained_scene_is_made_once_for_all_who_start_from_it(toy_plugins: Plu
     assert invocation.said.count("no trained toy scene for this configuration yet: training it first") == 1
     (cached,) = (tmp_path / ".trained").iterdir()
     assert cached.name.startswith("demo-tiny-toy-")
-    assert first.facts["pretraining"]["toy"]["steps"] == 6  # its own preset `quick`
+    assert first.facts.pretraining["toy"].steps == 6  # its own preset `quick`
 
     again = Run(toy_plugins, tmp_path)
     resolved = config(toy_plugins, "iterations=2", method="toy-student")
@@ -297,7 +298,7 @@ def test_a_changed_configuration_does_not_replace_the_one_that_was_trained(toy_p
         train_only(invocation.session, invocation.request("iterations=3"))
     assert (directory / "config.toml").read_text() == before
     fresh = RunRequest(invocation.request("iterations=3").resolved, tmp_path, resume=False)
-    assert train_only(invocation.session, fresh)[0].facts["steps"] == 3
+    assert train_only(invocation.session, fresh)[0].facts.steps == 3
     assert "iterations = 3" in (directory / "config.toml").read_text()
 
 
@@ -308,6 +309,6 @@ def test_starting_again_does_not_take_the_training_of_another_rate_point(toy_plu
     for rate in ("r1", "r2"):
         resolved = new.request("iterations=2", rate=rate).resolved
         found, _ = train_only(new.session, RunRequest(resolved, tmp_path, resume=False))
-        assert found.facts["trained_in"] == "r1"
+        assert found.facts.trained_in == "r1"
     assert sum(line.startswith("training toy") for line in new.said) == 1
     assert (tmp_path / "demo-tiny/toy/r1/checkpoints").is_dir()  # else nothing would be left to encode again

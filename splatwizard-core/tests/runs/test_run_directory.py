@@ -13,10 +13,11 @@ from types import SimpleNamespace
 
 import pytest
 
+from splatwizard_core.base import lock
+from splatwizard_core.base.lock import directory_lock
 from splatwizard_core.errors import RunLockedError, SceneError
-from splatwizard_core.runs import lock
 from splatwizard_core.runs.directory import OWN_FILES, RunRequest, StepLog
-from splatwizard_core.runs.lock import directory_lock
+from splatwizard_core.runs.facts import StepFacts
 from splatwizard_core.runs.run import run
 from splatwizard_core.runs.training import CACHE
 from splatwizard_core.training.params import PipelineParams
@@ -24,7 +25,7 @@ from splatwizard_core.training.params import PipelineParams
 HOLD = """
     import sys, time
     from pathlib import Path
-    from splatwizard_core.runs.lock import directory_lock
+    from splatwizard_core.base.lock import directory_lock
     with directory_lock(Path(sys.argv[1])):
         print("held", flush=True)
         time.sleep(3600)
@@ -130,17 +131,20 @@ def test_one_process_cannot_lock_twice(tmp_path: Path):
 
 
 def test_a_step_is_done_only_under_the_key_it_was_done_with(tmp_path: Path):
-    StepLog(tmp_path).finish("train", "key", {"seconds": 1.5})
+    StepLog(tmp_path).finish("train", "key", StepFacts(contended={"train": 0.5}))
     again = StepLog(tmp_path)
-    assert again.done("train", "key") == {"seconds": 1.5}
-    assert again.done("train", "other") is None
-    assert again.done("encode", "key") is None
+    assert again.done("train", "key", StepFacts).contended == {"train": 0.5}
+    assert again.done("train", "other", StepFacts) is None
+    assert again.done("encode", "key", StepFacts) is None
 
 
-@pytest.mark.parametrize("content", ["", "{", "[]", '{"train": 3}', '{"train": {"key": 1}}'])
+WRONG = '{"train": {"key": "key", "facts": {"contended": 3}}}'
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"train": 3}', '{"train": {"key": 1}}', WRONG])
 def test_a_damaged_step_log_means_that_nothing_is_done(tmp_path: Path, content: str):
     (tmp_path / "steps.json").write_text(content)
-    assert StepLog(tmp_path).done("train", "key") is None
+    assert StepLog(tmp_path).done("train", "key", StepFacts) is None
 
 
 def test_the_page_about_run_directories_says_what_is():

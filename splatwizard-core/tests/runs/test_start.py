@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ import torch
 from sw_gaussians.ply import export_ply
 from sw_gaussians.start import gaussians_from_points
 
+from splatwizard_core.base.lock import directory_lock
 from splatwizard_core.cli.main import main
 from splatwizard_core.cli.setup import Choices
 from splatwizard_core.errors import CheckpointError, ConfigError, SplatwizardError, UserInputError
@@ -20,7 +22,6 @@ from splatwizard_core.plugins import PluginManager
 from splatwizard_core.runs.config import ResolvedConfig, parse_set, resolve
 from splatwizard_core.runs.directory import RunRequest
 from splatwizard_core.runs.identity import training_key
-from splatwizard_core.runs.lock import directory_lock
 from splatwizard_core.runs.pretrained import check_model, checked_start
 from splatwizard_core.runs.record import Record, missing_reasons
 from splatwizard_core.runs.run import run, train_only
@@ -99,7 +100,7 @@ def test_what_a_file_is_drawn_with_is_kept_where_nothing_is_trained(toy_plugins,
         trained, _ = Run(toy_plugins, tmp_path / "out" / str(len(sets)) / sets[0]).train(
             f"init={tmp_path / 'smooth.ply'}", *sets
         )
-        return trained.facts["raster"]
+        return trained.facts.raster
 
     assert asked("iterations=0") == {"antialias": True}
     assert asked("iterations=0", "raster.antialias=false") == {}
@@ -154,7 +155,7 @@ def test_the_preset_of_a_run_is_that_of_what_it_starts_from(toy_plugins, tmp_pat
     invocation = Run(toy_plugins, tmp_path)
     for preset, steps in (("quick", 6), ("paper", 8)):
         found = trained_scene(invocation.session, "toy", invocation.resolved(preset=preset), tmp_path)
-        assert found.facts["steps"] == steps
+        assert found.facts.steps == steps
 
 
 @pytest.mark.parametrize(
@@ -204,7 +205,7 @@ def test_rate_points_and_teachers_do_not_read_it_again(toy_plugins, tmp_path):
     second = trained_scene(invocation.session, "toy", invocation.resolved("iterations=3"), tmp_path)
     assert second is first
     other = trained_scene(invocation.session, "toy", invocation.resolved("pretrained.iterations=2"), tmp_path)
-    assert other.facts["steps"] == 2
+    assert other.facts.steps == 2
 
 
 def test_of_several_methods_those_that_start_from_nothing_leave_it_to_the_others(toy_plugins, tmp_path, ply, capsys):
@@ -225,25 +226,49 @@ def test_of_several_methods_those_that_start_from_nothing_leave_it_to_the_others
     assert (pupil.pretrained, taught.pretrained) == ({"iterations": 3}, {})
 
 
-def test_what_is_set_for_several_methods_also_trains_what_one_of_them_starts_from(toy_plugins):
-    def resolved(*methods: str, sets: tuple[str, ...] = ("iterations=3", "codec.kind=f2", "log_every=5")):
-        return Choices(methods, sets=sets).resolve(toy_plugins)
+def test_what_is_set_also_trains_what_a_method_starts_from(toy_plugins, tmp_path):
+    def resolved(*methods: str, sets: tuple[str, ...] = ("iterations=3", "codec.kind=f2", "log_every=5"), **more):
+        return Choices(methods, sets=sets, **more).resolve(toy_plugins)
 
     plain, student = resolved("toy", "toy-student")
     assert (plain.config.iterations, dict(plain.pretrained)) == (3, {})
     assert (student.config.iterations, dict(student.pretrained)) == (3, {"iterations": 3})
     told: list[str] = []
     Choices(("toy",), preset="quick").settled([plain, student], toy_plugins, lambda each: None, told.append)
-    assert told == ["toy-student: the trained scene that it starts from has iterations=3 too"]
-    assert not resolved("toy-student")[0].pretrained  # said of it alone
+    about = "toy-student: the trained scene that it starts from has iterations=3 too"
+    assert told == [f"{about} (--set pretrained.KEY=VALUE decides)"]
+    (alone,) = resolved("toy-student")
+    assert alone == student
+    assert not resolved("toy-student", sets=("iterations=0",))[0].pretrained  # a trained scene has steps
+    (file := tmp_path / "some.toml").write_text("method = 'toy-student'\niterations = 3\n")
+    (said,) = resolved("toy-student", sets=(), config_file=str(file))
+    assert dict(said.pretrained) == {"iterations": 3}
+    file.write_text(replace(alone, pretrained={}).toml())  # of a run, whose table `pretrained` says it all
+    assert not resolved("toy-student", sets=(), config_file=str(file))[0].pretrained
     _, own = resolved("toy", "toy-student", sets=("iterations=3", "pretrained.iterations=5"))
     assert dict(own.pretrained) == {"iterations": 5}
 
 
 def test_a_teacher_is_trained_as_asked(toy_plugins, tmp_path):
     found, _ = Run(toy_plugins, tmp_path).train("pretrained.iterations=2", method="toy-pupil")
-    assert found.facts["pretraining"]["toy"]["steps"] == 2
-    assert [phase["phase"] for phase in found.facts["phases"]] == ["train: toy", "train: taught"]
+    assert found.facts.pretraining["toy"].steps == 2
+    assert [phase.phase for phase in found.facts.phases] == ["train: toy", "train: taught"]
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
+def test_a_pipe_is_told_as_such(toy_plugins, tmp_path, capsys):
+    pipes = [tmp_path / "x.ply", tmp_path / "x.swz", tmp_path / "x"]
+    for pipe in pipes:
+        os.mkfifo(pipe)
+    told = "no file but a pipe or a device: write what comes out of it into a file first"
+    with pytest.raises(UserInputError, match=f"init: .*x.ply: {told}"):
+        check_model(str(pipes[0]))
+    training = ["train", "--method", "toy-student", "--out", str(tmp_path), "--set", "init_points=3", "--init"]
+    for words in (["info"], ["eval", "--scene", "demo:tiny"], ["decode", "--out", str(tmp_path / "y")], ["encode"],
+                  ["export"], training, [*training[:-1], "--scene"]):  # fmt: skip
+        for pipe in pipes:
+            assert main([*words, str(pipe), *(["y.ply"] if words == ["export"] else [])]) == 2
+            assert told in capsys.readouterr().err, (words, pipe)
 
 
 def test_an_interrupted_scene_is_gone_on_with(toy_plugins, tmp_path):
@@ -258,6 +283,7 @@ def test_an_interrupted_scene_is_gone_on_with(toy_plugins, tmp_path):
         train(invocation.session, RunRequest(base, tmp_path), directory, stop_after=2)
     trained_scene(invocation.session, "toy", resolved, tmp_path)
     assert "the trained toy scene for this configuration is not finished yet: going on with it first" in invocation.said
+    assert "going on after step 2 of 6" in invocation.said
 
 
 def test_an_ordinary_run_takes_what_others_started_from(toy_plugins, tmp_path):
@@ -268,7 +294,7 @@ def test_an_ordinary_run_takes_what_others_started_from(toy_plugins, tmp_path):
     assert not any(line.startswith("training toy on") for line in again.said)
     assert any("shares the training that others started from" in line for line in again.said)
     assert (directory / "log.jsonl").is_file()
-    assert found.facts["steps"] == 6
+    assert found.facts.steps == 6
 
 
 def test_a_finished_student_is_encoded_from_its_directory(toy_plugins, tmp_path, capsys):

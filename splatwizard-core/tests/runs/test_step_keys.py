@@ -23,6 +23,7 @@ from splatwizard_core.plugins.versions import changes, installed
 from splatwizard_core.runs import run as run_module
 from splatwizard_core.runs.config import parse_set, read_config_file, resolve
 from splatwizard_core.runs.directory import RunRequest, StepLog, run_directory
+from splatwizard_core.runs.facts import EncodingFacts, TrainingFacts
 from splatwizard_core.runs.run import run, train_only
 from splatwizard_core.runs.session import Session
 from splatwizard_core.scene.dataset import SceneOptions
@@ -171,7 +172,8 @@ def test_every_key_after_encoding_holds_the_versions(
     request = invocation.request()
 
     def keys() -> set[str]:
-        facts = {"sha256": "0", "made_by": installed(toy_plugins, ["sw-toy"])}
+        made_by = installed(toy_plugins, ["sw-toy"])
+        facts = EncodingFacts(encode_s=0.0, bytes=1, sha256="0", made_by=made_by)
         return set(run_module.step_keys(invocation.session, request.resolved, facts).values())
 
     before = keys()
@@ -196,8 +198,8 @@ def test_a_shared_training_that_was_removed_is_made_again(toy_plugins: PluginMan
     again = Invocation(toy_plugins, tmp_path)
     found, _ = train_only(again.session, again.request(rate="r2"))
     assert found.model.digest() == expected.model.digest()
-    assert found.facts["trained_in"] == "r2"
-    assert StepLog(sharing).done("train", found.key) == found.facts
+    assert found.facts.trained_in == "r2"
+    assert StepLog(sharing).done("train", found.key, TrainingFacts).trained_in == "r2"
 
 
 class Start(Params):

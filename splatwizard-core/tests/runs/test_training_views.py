@@ -36,7 +36,7 @@ def of_black_model(*grey: int) -> tuple[Any, dict[str, str]]:
 def test_mean_median_and_quantile_are_those_of_the_views():
     found, reasons = of_black_model(51, 26, 51, 128)
     one, ten, half = (-20 * math.log10(g / 255) for g in (51, 26, 128))
-    assert found == {
+    assert found.model_dump() == {
         "mean": pytest.approx((2 * one + ten + half) / 4), "median": pytest.approx(one),
         "quantile_05": pytest.approx(half), "far_below": {},
     }  # fmt: skip
@@ -45,30 +45,30 @@ def test_mean_median_and_quantile_are_those_of_the_views():
 
 def test_the_quantile_is_a_view_that_at_least_five_percent_lie_at_or_below():
     found, _ = summary({str(i): float(i) for i in range(1, 61)})
-    assert (found["quantile_05"], found["median"], found["mean"]) == (3.0, 30.5, 30.5)
-    assert summary({"a": 7.0})[0]["quantile_05"] == 7.0
+    assert (found.quantile_05, found.median, found.mean) == (3.0, 30.5, 30.5)
+    assert summary({"a": 7.0})[0].quantile_05 == 7.0
 
 
 def test_renders_are_rounded_to_8_bit_as_the_test_views_are_and_no_picture_is_kept():
     scene = Scene("s", views(100), [], None, Protocol("x"))
     found, _ = training_psnr(scene, lambda camera: torch.full((3, 3, 4), 100.4 / 255), CPU)
-    assert found["mean"] is None  # identical after rounding
+    assert found.mean is None  # identical after rounding
     assert not any("pixels" in vars(view) for view in scene.train)
 
 
 def test_views_far_below_the_median_are_named_lowest_first():
     found, _ = summary({"a": 30.0, "e": 21.9, "c": 22.0, "d": 31.0, "b": 12.0, "f": 30.0, "g": 32.0})
-    assert found["median"] == 30.0
-    assert list(found["far_below"].items()) == [("b", 12.0), ("e", 21.9)]  # 22.0 is 8 dB below, not more
+    assert found.median == 30.0
+    assert list(found.far_below.items()) == [("b", 12.0), ("e", 21.9)]  # 22.0 is 8 dB below, not more
 
 
 def test_what_is_not_finite_is_null_with_its_reason():
     found, reasons = summary({"a": math.inf, "b": 30.0, "c": 29.0})
-    assert (found["mean"], found["median"], found["quantile_05"]) == (None, 30.0, 29.0)
+    assert (found.mean, found.median, found.quantile_05) == (None, 30.0, 29.0)
     assert list(reasons) == ["training_psnr.mean"]
     assert "identical" in reasons["training_psnr.mean"]
     found, reasons = summary({"a": math.inf, "b": math.inf, "c": 29.0})
-    assert (found["median"], found["far_below"]) == (None, {})
+    assert (found.median, found.far_below) == (None, {})
     assert summary({"a": math.nan, "b": 30.0})[0] is None
     assert "not a number" in summary({"a": math.nan, "b": 30.0})[1]["training_psnr"]
     assert of_black_model() == (None, {"training_psnr": "the scene has no training views"})

@@ -36,7 +36,7 @@ def test_stopped_and_resumed_equals_one_go(toy, whole, tmp_path, stop):
         toy.train(iterations=200, directory=tmp_path, stop_after=stop)
     resumed = toy.train(iterations=200, directory=tmp_path)
     assert resumed.model.digest() == whole.model.digest()
-    assert resumed.steps == 200
+    assert resumed.figures.steps == 200
 
 
 def test_many_stops_equal_one_go(toy, whole, tmp_path):
@@ -243,7 +243,7 @@ def test_a_finished_run_is_only_loaded(toy, whole, tmp_path):
     again = toy.train(iterations=200, directory=tmp_path, on_step=lambda _, r: steps.append(r.step))
     assert steps == []
     assert again.model.digest() == first.model.digest() == whole.model.digest()
-    assert (again.steps, again.train_s, again.stage_seconds) == (first.steps, first.train_s, first.stage_seconds)
+    assert again.figures == first.figures
     assert again.plan == first.plan
     with pytest.raises(TrainingStopped):
         # Stopping at the very end of the last stage is finishing; before, it is not.
@@ -277,7 +277,7 @@ def test_a_stage_may_have_no_steps_and_is_finished_at_once(toy, tmp_path):
         iterations = 0
 
     outcome = toy.train([NoSteps(OptimizationParams())], directory=tmp_path)
-    assert outcome.steps == 0
+    assert outcome.figures.steps == 0
     again = toy.train([NoSteps(OptimizationParams())], directory=tmp_path)
     assert again.model.digest() == outcome.model.digest() == toy.make_model(toy.scene).digest()
 
@@ -290,7 +290,7 @@ def test_a_finished_run_can_be_made_longer(toy, tmp_path):
         on_step=lambda _, r: steps.append(r.step),
     )  # fmt: skip
     assert steps == list(range(101, 151))
-    assert longer.steps == 150
+    assert longer.figures.steps == 150
 
 
 def test_another_configuration_is_refused_and_named(toy, tmp_path, caplog):
@@ -313,7 +313,7 @@ def test_another_plan_is_refused_and_shown(toy, tmp_path, caplog):
     other = [Other(OptimizationParams(iterations=60))]
     with pytest.raises(CheckpointError, match=r"plan \+ pre \| new idea \| range\(5, 50, 5\)"):
         toy.train(other, directory=tmp_path)
-    assert toy.train(other, directory=tmp_path, allow_changed_plan=True).steps == 60
+    assert toy.train(other, directory=tmp_path, allow_changed_plan=True).figures.steps == 60
     assert "plan + pre | new idea" in caplog.text
 
 
@@ -407,7 +407,7 @@ def test_stop_by_a_task_finishes_the_stage_for_good(toy, tmp_path):
 
     stages = [Stopping(OptimizationParams(iterations=200))]
     first = toy.train(stages, directory=tmp_path)
-    assert first.steps == 33
+    assert first.figures.steps == 33
     steps = []
     again = toy.train(stages, directory=tmp_path, on_step=lambda _, r: steps.append(r.step))
     assert steps == []
@@ -471,10 +471,10 @@ def test_times_and_steps_add_up_over_processes(toy, now, tmp_path):
     now[0] = 0.0  # another process, another clock
     outcome = toy.train(**same)
     assert part["stage_steps"] == {"toy": 59}
-    assert (part["stage_seconds"]["toy"], outcome.train_s) == (118, 120)
-    assert (part["breakdown"]["toy"]["render"], outcome.breakdown["toy"]["render"]) == (118, 120)
-    assert outcome.steps == 60
-    assert outcome.peak_memory >= part["peak_memory"] >= 0
+    assert (part["stage_seconds"]["toy"], outcome.figures.train_s) == (118, 120)
+    assert (part["breakdown_s"]["toy"]["render"], outcome.figures.breakdown_s["toy"]["render"]) == (118, 120)
+    assert outcome.figures.steps == 60
+    assert outcome.figures.peak_bytes >= part["peak_bytes"] >= 0
 
 
 def test_a_failing_task_leaves_the_last_checkpoint(toy, tmp_path):

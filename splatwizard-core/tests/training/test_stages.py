@@ -114,12 +114,12 @@ def make(toy, teacher):
 
 def test_stages_follow_each_other_and_are_told_apart(make):
     outcome = make()
-    assert list(outcome.stage_seconds) == ["toy", "mask", "toy-2"]
-    assert outcome.steps == 130
-    assert outcome.train_s == pytest.approx(sum(outcome.stage_seconds.values()))
-    assert [(p["stage"], p["iterations"]) for p in outcome.plan] == [("toy", 60), ("mask", 40), ("toy-2", 30)]
-    assert outcome.plan[0]["tasks"][0] == {"stage": "Pre", "task": "update lr", "plan": "range(200)", "priority": 0}
-    assert outcome.plan[1]["tasks"] == []
+    assert list(outcome.figures.stage_seconds) == ["toy", "mask", "toy-2"]
+    assert outcome.figures.steps == 130
+    assert outcome.figures.train_s == pytest.approx(sum(outcome.figures.stage_seconds.values()))
+    assert [(p.stage, p.iterations) for p in outcome.plan] == [("toy", 60), ("mask", 40), ("toy-2", 30)]
+    assert outcome.plan[0].tasks[0] == {"stage": "Pre", "task": "update lr", "plan": "range(200)", "priority": 0}
+    assert outcome.plan[1].tasks == []
 
 
 @pytest.mark.parametrize("stop", [1, 59, 60, 61, 99, 100, 101, 129])
@@ -129,9 +129,9 @@ def test_resuming_in_any_stage_equals_one_go(make, tmp_path, stop):
         make(directory=tmp_path, stop_after=stop)
     resumed = make(directory=tmp_path)
     assert resumed.model.digest() == expected.model.digest()
-    assert resumed.steps == 130
+    assert resumed.figures.steps == 130
     assert resumed.plan == expected.plan
-    assert list(resumed.stage_seconds) == list(expected.stage_seconds)
+    assert list(resumed.figures.stage_seconds) == list(expected.figures.stage_seconds)
 
 
 def test_a_finished_run_of_several_stages_is_only_loaded(make, tmp_path):

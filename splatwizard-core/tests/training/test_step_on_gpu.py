@@ -18,6 +18,7 @@ from splatwizard_core.training.losses import LossPack
 from splatwizard_core.training.optimizer import SplatOptimizer
 from splatwizard_core.training.params import OptimizationParams, PipelineParams
 from splatwizard_core.training.rng import Streams
+from splatwizard_core.training.state import TrainingState
 from splatwizard_core.training.trainer import CHECK_EVERY, Trainer
 from splatwizard_native import DeviceMemoryError, Verdict, read_scalars
 
@@ -27,7 +28,10 @@ TORCH_SAYS = "CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has a total 
 
 def as_if_on_gpu(toy, stage):
     """A trainer that looks at losses as it does on a GPU."""
-    trainer = Trainer(stage, toy.make_model(toy.scene), toy.scene, PipelineParams(), toy.Rasterizer(), Streams(0))
+    state = TrainingState.begin(
+        stage, toy.make_model(toy.scene), toy.scene, PipelineParams(), toy.Rasterizer(), Streams(0)
+    )
+    trainer = Trainer(state)
     trainer.device = torch.device("meta")  # anything but a CPU
     trainer._camera = lambda view: view.camera
     trainer._background = torch.zeros(3)
@@ -54,7 +58,7 @@ def test_a_loss_that_is_not_finite_is_told_at_most_two_looks_later(toy, bad):
     trainer = as_if_on_gpu(toy, stage_with(toy, 1000, bad_at=(bad,)))
     with pytest.raises(TrainingDiverged, match=f"at step {bad}:"):
         trainer.run(1000, lambda record: None)
-    assert bad <= trainer.step <= bad + 2 * CHECK_EVERY
+    assert bad <= trainer.state.step <= bad + 2 * CHECK_EVERY
 
 
 def test_no_verdict_is_waited_for_when_it_is_asked(toy, monkeypatch: pytest.MonkeyPatch):
@@ -62,11 +66,11 @@ def test_no_verdict_is_waited_for_when_it_is_asked(toy, monkeypatch: pytest.Monk
 
     class Watched(Verdict):
         def __init__(self, totals):
-            asked_at.append(trainer.step + 1)
+            asked_at.append(trainer.state.step)
             super().__init__(totals)
 
         def fine(self):
-            heard_at.append(trainer.step + 1)
+            heard_at.append(trainer.state.step)
             return super().fine()
 
     monkeypatch.setattr(trainer_module, "Verdict", Watched)
@@ -140,7 +144,7 @@ def test_out_of_memory_names_the_figures_and_leaves_the_run_resumable(toy, tmp_p
     assert "last checkpoint" in str(info.value)
     Fails.full = False
     resumed, straight = train(tmp_path / "run"), train(tmp_path / "straight")
-    assert resumed.steps == 60
+    assert resumed.figures.steps == 60
     assert resumed.model.digest() == straight.model.digest()
 
 
@@ -158,7 +162,7 @@ def test_pictures_are_kept_on_a_gpu_only_where_they_fit(toy, monkeypatch: pytest
     assert not keep_pictures([], "cuda")
     assert not keep_pictures(toy.scene.train, "cpu")
     assert all(v.kept_on.type == "cpu" for v in toy.scene.train)
-    assert toy.train(iterations=3).pictures_in == "host"
+    assert toy.train(iterations=3).figures.pictures_in == "host"
 
 
 def test_a_camera_that_is_moved_keeps_its_numbers(toy):
@@ -206,7 +210,7 @@ def test_the_optimizers_memory_goes_with_the_training(toy):
     gc.disable()  # nobody may have to look for rings before a GPU's memory is free
     try:
         outcome = toy.train([Watched(OptimizationParams(iterations=5))])
-        assert outcome.steps == 5
+        assert outcome.figures.steps == 5
         assert made[0]() is None
     finally:
         gc.enable()

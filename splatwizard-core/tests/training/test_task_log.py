@@ -2,6 +2,7 @@
 
 import json
 import math
+from copy import copy
 
 import pytest
 import torch
@@ -69,7 +70,7 @@ def test_what_a_task_says_is_one_line_in_the_terminal(toy, talking, capsys):
 
 def test_an_observer_gets_both(toy, talking):
     records = {}
-    toy.train(talking(30), on_step=lambda _, r: records.update({r.step: r}))
+    toy.train(talking(30), on_step=lambda _, state: records.update({state.step: copy(state)}))
     assert records[15].said[-1][0] == "count rows"
     assert set(records[30].scalars) == {"early", "rows", "mean opacity"}
     assert records[30].scalars["rows"].item() > 0

@@ -2,6 +2,7 @@
 
 import json
 import math
+from copy import copy
 from dataclasses import replace
 
 import pytest
@@ -24,6 +25,7 @@ from splatwizard_core.training.params import OptimizationParams, PipelineParams
 from splatwizard_core.training.pipeline import TrainingRun
 from splatwizard_core.training.rng import Streams
 from splatwizard_core.training.scheduler import STOP
+from splatwizard_core.training.state import TrainingState
 from splatwizard_core.training.trainer import Trainer
 
 
@@ -47,7 +49,9 @@ def make_stage(toy, *, iterations=10, pre=(), post=(), loss=None):
 
 def make_trainer(toy, stage, *, scene=None, ppl=None):
     scene = scene or toy.scene
-    return Trainer(stage, toy.make_model(scene), scene, ppl or PipelineParams(), toy.Rasterizer(), Streams(0))
+    return Trainer(
+        TrainingState.begin(stage, toy.make_model(scene), scene, ppl or PipelineParams(), toy.Rasterizer(), Streams(0))
+    )
 
 
 def test_a_step_runs_its_stages_in_order(toy):
@@ -70,21 +74,21 @@ def test_a_step_runs_its_stages_in_order(toy):
 
     stage = make_stage(toy, pre=[(range(10), before)], post=[(range(10), after)], loss=loss)
     trainer = make_trainer(toy, stage)
-    start = trainer.model.means.detach().clone()
+    start = trainer.state.model.means.detach().clone()
     trainer.run(1, lambda record: None)
     assert order == [("pre", True, False), ("loss", True, True), ("post", True, False)]
-    assert not torch.equal(trainer.model.means, start)
-    assert trainer.model.means.grad is None
+    assert not torch.equal(trainer.state.model.means, start)
+    assert trainer.state.model.means.grad is None
 
 
 def test_the_last_step_makes_no_update(toy):
     trainer = make_trainer(toy, make_stage(toy, iterations=3))
-    digests = [trainer.model.digest()]
-    trainer.run(3, lambda record: digests.append(trainer.model.digest()))
+    digests = [trainer.state.model.digest()]
+    trainer.run(3, lambda record: digests.append(trainer.state.model.digest()))
     assert digests[1] != digests[0]
     assert digests[2] != digests[1]
     assert digests[3] == digests[2]
-    assert trainer.optimizer.moments("means")[2] == 2
+    assert trainer.state.optimizer.moments("means")[2] == 2
 
 
 def test_a_replaced_parameter_is_not_updated_in_its_step(toy):
@@ -93,12 +97,12 @@ def test_a_replaced_parameter_is_not_updated_in_its_step(toy):
 
     trainer = make_trainer(toy, make_stage(toy, post=[(2, reset)]))
     trainer.run(1, lambda record: None)
-    means = trainer.model.means.detach().clone()
+    means = trainer.state.model.means.detach().clone()
     trainer.run(2, lambda record: None)
-    assert (trainer.model.opacity_logits == -1).all()
-    assert not torch.equal(trainer.model.means, means)
-    assert trainer.optimizer.moments("opacity_logits")[2] == 1
-    assert trainer.optimizer.moments("means")[2] == 2
+    assert (trainer.state.model.opacity_logits == -1).all()
+    assert not torch.equal(trainer.state.model.means, means)
+    assert trainer.state.optimizer.moments("opacity_logits")[2] == 1
+    assert trainer.state.optimizer.moments("means")[2] == 2
 
 
 def test_at_a_densification_nothing_is_updated(toy):
@@ -107,12 +111,12 @@ def test_at_a_densification_nothing_is_updated(toy):
 
     trainer = make_trainer(toy, make_stage(toy, post=[(2, restructure)]))
     trainer.run(1, lambda record: None)
-    before = {n: p.detach()[1:].clone() for n, p in trainer.model.named_parameters()}
+    before = {n: p.detach()[1:].clone() for n, p in trainer.state.model.named_parameters()}
     trainer.run(2, lambda record: None)
-    for name, parameter in trainer.model.named_parameters():
+    for name, parameter in trainer.state.model.named_parameters():
         assert torch.equal(parameter, before[name])
         if name != "quats":  # the toy rasterizer's splats are round
-            assert trainer.optimizer.moments(name)[2] == 1
+            assert trainer.state.optimizer.moments(name)[2] == 1
 
 
 def test_tasks_can_render_for_scores(toy):
@@ -131,8 +135,8 @@ def test_stop_ends_training_after_the_whole_step(toy, where):
     steps = []
     trainer.run(10, lambda record: steps.append(record.step))
     assert steps == [1, 2, 3, 4]
-    assert trainer.stopped
-    assert trainer.optimizer.moments("means")[2] == 4
+    assert trainer.state.stopped
+    assert trainer.state.optimizer.moments("means")[2] == 4
 
 
 def test_a_loss_that_is_not_finite_names_step_camera_and_part(toy):
@@ -146,7 +150,7 @@ def test_a_loss_that_is_not_finite_names_step_camera_and_part(toy):
     with pytest.raises(TrainingDiverged, match="at step 3: loss part 'rate' is nan") as info:
         trainer.run(10, lambda record: views.append(record.view))
     assert info.value.camera in {v.name for v in toy.scene.train} - set(views)
-    assert all(p.isfinite().all() for p in trainer.model.parameters())
+    assert all(p.isfinite().all() for p in trainer.state.model.parameters())
 
 
 def test_an_infinite_total_of_finite_parts_is_named_total(toy):
@@ -167,7 +171,7 @@ def test_losses_on_a_gpu_are_looked_at_in_batches_and_the_first_bad_one_is_named
     trainer._background = torch.zeros(3)
     with pytest.raises(TrainingDiverged, match="at step 5"):
         trainer.run(10, lambda record: None)
-    assert trainer.step == 10
+    assert trainer.state.step == 10
 
 
 @pytest.mark.parametrize("where", ["pre", "post"])
@@ -200,7 +204,7 @@ def test_a_task_for_another_model_fails_before_the_first_step(toy):
 
 def test_at_or_past_the_end_there_is_nothing_to_do(toy):
     trainer = make_trainer(toy, make_stage(toy, iterations=3))
-    trainer.step = 3
+    trainer.state.step = 3
     with pytest.raises(NothingToDo, match="ends at step 3, and 3 steps are done"):
         trainer.run(3, lambda record: None)
 
@@ -208,7 +212,7 @@ def test_at_or_past_the_end_there_is_nothing_to_do(toy):
 def test_the_fixed_background_is_the_scenes(toy):
     trainer = make_trainer(toy, make_stage(toy))
     trainer.run(3, lambda record: None)
-    assert all(torch.equal(b, toy.scene.background) for b in trainer.rasterizer.backgrounds)
+    assert all(torch.equal(b, toy.scene.background) for b in trainer.state.rasterizer.backgrounds)
 
 
 def test_a_random_background_and_pictures_composited_at_load_are_refused(toy):
@@ -253,9 +257,19 @@ def test_a_random_background_is_fresh_each_step_and_the_same_for_render_and_trut
     scene = toy.make_scene(rgba=True)
     trainer = make_trainer(toy, make_stage(toy, loss=loss), scene=scene, ppl=PipelineParams(random_background=True))
     trainer.run(5, lambda record: None)
-    assert trainer.rasterizer.backgrounds == seen
+    assert trainer.state.rasterizer.backgrounds == seen
     assert len({tuple(b.tolist()) for b in seen}) == 5
     assert all(((b >= 0) & (b < 1)).all() for b in seen)
+
+
+def test_a_stage_may_ask_for_random_backgrounds_of_its_own(toy):
+    stage = make_stage(toy)
+    stage.random_background = lambda step: step <= 3
+    trainer = make_trainer(toy, stage, scene=toy.make_scene(rgba=True))
+    trainer.run(5, lambda record: None)
+    *fresh, before_last, last = (tuple(b.tolist()) for b in trainer.rasterizer.backgrounds)
+    assert len({*fresh, last}) == 4
+    assert before_last == last == tuple(trainer.scene.background.tolist())
 
 
 def test_clamp_render_cuts_the_image_before_the_loss(toy):
@@ -286,8 +300,8 @@ def test_cameras_are_drawn_without_replacement(toy):
 def test_a_step_leaves_no_graph_behind(toy):
     trainer = make_trainer(toy, make_stage(toy))
     trainer.run(1, lambda record: None)
-    assert trainer.context.result is None
-    assert trainer.context.loss is None
+    assert trainer.state.result is None
+    assert trainer.state.loss is None
 
 
 def timed_stage(toy, now, iterations):
@@ -324,13 +338,13 @@ def timed_stage(toy, now, iterations):
 
 def test_stage_times_are_opt_in_and_add_up(toy, now):
     stage, rasterizer = timed_stage(toy, now, 20)
-    assert toy.train([stage], rasterizer=rasterizer).breakdown == {}
+    assert toy.train([stage], rasterizer=rasterizer).figures.breakdown_s is None
     outcome = toy.train([stage], rasterizer=rasterizer, ppl=PipelineParams(profile="stages"))
-    assert outcome.breakdown["toy"] == {
+    assert outcome.figures.breakdown_s["toy"] == {
         "pre": 20, "render": 40, "loss": 80, "backward": 160, "post": 320, "optimize": 0
     }  # fmt: skip
-    assert list(outcome.breakdown["toy"]) == list(timing.STAGES)
-    assert outcome.train_s == 620
+    assert list(outcome.figures.breakdown_s["toy"]) == list(timing.STAGES)
+    assert outcome.figures.train_s == 620
 
 
 def test_housekeeping_is_no_part_of_the_training_time(toy, now):
@@ -340,8 +354,8 @@ def test_housekeeping_is_no_part_of_the_training_time(toy, now):
     stage, rasterizer = timed_stage(toy, now, 20)
     outcome = toy.train([stage], rasterizer=rasterizer, on_step=slow, evaluate=slow, ppl=PipelineParams(eval_every=1))
     assert now[0] == 40 * 1000 + 620
-    assert outcome.train_s == 620
-    assert outcome.stage_seconds == {"toy": 620}
+    assert outcome.figures.train_s == 620
+    assert outcome.figures.stage_seconds == {"toy": 620}
 
 
 def test_an_evaluation_stands_beside_the_seconds_of_training_so_far(toy, now, tmp_path):
@@ -356,9 +370,14 @@ def test_an_evaluation_stands_beside_the_seconds_of_training_so_far(toy, now, tm
 
 
 def test_a_record_has_what_the_log_shows(toy, tmp_path):
-    records = []
+    records, rows = [], {}
     ppl = PipelineParams(log_every=7)
-    toy.train(iterations=30, on_step=lambda _, r: records.append(r), directory=tmp_path, ppl=ppl)
+
+    def keep(model, state):
+        records.append(copy(state))
+        rows[state.step] = state.num_rows
+
+    toy.train(iterations=30, on_step=keep, directory=tmp_path, ppl=ppl)
     assert [r.step for r in records] == list(range(1, 31))
     assert all(not r.total.requires_grad for r in records)
     lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
@@ -371,7 +390,7 @@ def test_a_record_has_what_the_log_shows(toy, tmp_path):
         assert line["view"] == record.view
         assert line["loss"] == record.total.item()
         assert line["parts"] == {"l1": record.parts["l1"].item()}
-        assert line["num_gaussians"] == record.num_rows
+        assert line["num_gaussians"] == rows[record.step]
     assert steps[1]["lr"]["means"] == pytest.approx(1e-2 * (1e-4 / 1e-2) ** (7 / 200))
     # Tasks registered with log=True leave a line as well.
     assert [line["step"] for line in lines if line.get("task") == "densify"] == [20, 30]

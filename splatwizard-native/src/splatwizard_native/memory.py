@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Literal
 
 import psutil
 import torch
@@ -54,7 +55,7 @@ class MemoryMeter:
 
     def __init__(self, device: torch.device | str) -> None:
         self.device = torch.device(device)
-        self.kind = "cuda" if self.device.type == "cuda" else "rss"
+        self.kind: Literal["cuda", "rss"] = "cuda" if self.device.type == "cuda" else "rss"
         self._before = self._peak = self._peak_reserved = 0
 
     def start(self) -> None:

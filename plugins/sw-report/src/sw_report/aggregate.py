@@ -74,13 +74,13 @@ def comparable(runs: Sequence[Run]) -> list[list[Run]]:
     """
     groups: dict[tuple[str, str], list[Run]] = {}
     for run in runs:
-        groups.setdefault((run.facts.dataset, run.facts.protocol.without_folder()), []).append(run)
+        groups.setdefault((run.facts.dataset, run.facts.protocol_without_folder()), []).append(run)
     found = []
     for group in groups.values():
         several = len({run.facts.protocol.id for run in group}) > 1
         named: dict[str, list[Run]] = {}
         for run in group:
-            named.setdefault(str(run.facts.protocol.rules().get("name")) if several else "", []).append(run)
+            named.setdefault(str(run.facts.rules().get("name")) if several else "", []).append(run)
         for part in named.values():
             found += _one_protocol_a_scene(part)
     return found

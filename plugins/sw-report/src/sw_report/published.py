@@ -57,7 +57,7 @@ def standing_for(preset: str | None, runs: Sequence[Run]) -> list[Run]:
 def differences(facts: RunFacts, figure: Figure) -> list[str]:
     """Name what differs between a run and a published figure: pictures, split, background, steps, values, and so on."""
     found = []
-    rules, protocol = facts.protocol.rules(), figure.protocol
+    rules, protocol = facts.rules(), figure.protocol
     for name, published in protocol.rules.items():
         here = rules.get(name)
         if here is not None and here not in (published if isinstance(published, list) else [published]):

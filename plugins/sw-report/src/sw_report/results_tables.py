@@ -11,7 +11,7 @@ from sw_report.bases import STEPS_NOTE, bases_notes
 from sw_report.blocks import Cell, Column, Note, Row, Table, columns, row
 from sw_report.declared import metric_style
 from sw_report.distortion import BdCell, BdTable
-from sw_report.facts import RunFacts, clean
+from sw_report.facts import RunFacts, clean, shown
 from sw_report.marks import marked
 from sw_report.runs import Run, machine
 
@@ -59,7 +59,7 @@ def runs_table(runs: Sequence[Run]) -> Table:
         cells += [
             Cell(numbers.megabytes(run.size), f"{run.size:,.0f} bytes"),
             numbers.counts({unit: round(n) for unit, n in run.counts.items()}),
-            facts.train.all_steps(),
+            facts.all_steps(),
             *(_measured(run, column, marks) for column in MEASURED),
         ]
         rows.append(row(cells))
@@ -237,7 +237,7 @@ def _bd(cell: BdCell, text: str) -> Cell:
 
 def protocol_table(runs: Sequence[Run]) -> Table:
     """Rules of each protocol, one column a protocol; rows in which they differ are marked."""
-    protocols = {run.facts.protocol.id: run.facts.protocol.rules() for run in runs}
+    protocols = {run.facts.protocol.id: run.facts.rules() for run in runs}
     names = list(dict.fromkeys(name for rules in protocols.values() for name in rules))
     several = len(protocols) > 1
     heads = ["rule", *protocols] + ["" for _ in range(several)]
@@ -315,9 +315,9 @@ def phases_table(runs: Sequence[Run]) -> Table | None:
     """Parts that served each phase, by distribution; None if no record holds them."""
     groups: dict[tuple[str, str, str], list[Run]] = {}
     for run in runs:
-        for phase in run.facts.phases:
-            served = "; ".join(f"{owner}: {', '.join(parts)}" for owner, parts in phase.by_distribution().items())
-            groups.setdefault((run.variant, phase.phase, served or numbers.MISSING), []).append(run)
+        for phase, distributions in run.facts.served():
+            served = "; ".join(f"{owner}: {', '.join(parts)}" for owner, parts in distributions.items())
+            groups.setdefault((run.variant, phase, served or numbers.MISSING), []).append(run)
     if not groups:
         return None
     # The phases of one method stand together, however its runs differ.
@@ -331,7 +331,7 @@ def cost_table(facts: RunFacts) -> Table:
     """Times and memory of one run."""
     kind = {"rss": "growth of the resident set", "cuda": "CUDA allocator"}
 
-    def size(value: int | None, what: str | None) -> tuple[str, str]:
+    def size(value: float | None, what: str | None) -> tuple[str, str]:
         return (numbers.MISSING if value is None else f"{value / 1e6:,.0f} MB"), kind.get(what or "", "")
 
     def time(value: float | None) -> str:
@@ -342,16 +342,15 @@ def cost_table(facts: RunFacts) -> Table:
     drawn = "" if speed.image_size is None else f"at {speed.image_size[0]} × {speed.image_size[1]} px"
     entries = [
         ("training", time(facts.train.train_s), f"{numbers.count(facts.train.steps)} steps"),
-        ("training, with what it starts from", time(facts.train.with_pretraining_s), facts.train.started_from()),
+        ("training, with what it starts from", time(facts.train.with_pretraining_s), facts.started_from()),
         ("training memory", *size(facts.train.peak_bytes, facts.train.memory_kind)),
-        ("encoding", time(facts.codec.encode_s), ""),
-        ("decoding", time(facts.codec.decode_s), "median, fresh process"),
         ("rendering", f"{numbers.rate(speed.fps)} FPS", drawn),
         ("latency", f"{latency[0]}", f"median; 95 % of frames under {latency[1]}"),
         ("rendering memory", *size(memory.peak_render_bytes, memory.kind)),
         ("model memory", *size(memory.model_bytes, memory.kind)),
-        ("visible primitives", numbers.count(facts.visible_gaussians), "mean over the test views"),
     ]
+    spelt = {"s": time, "bytes": lambda value: size(value, None)[0], "": numbers.count}
+    entries += [(mark.label, spelt[mark.unit](value), what) for mark, value, what in shown(facts)]
     shared = facts.train.trained_in
     notes = [f"Training is shared with rate point {shared}."] if shared and shared != facts.rate else []
     if any(value.startswith(numbers.MISSING) for _, value, _ in entries):

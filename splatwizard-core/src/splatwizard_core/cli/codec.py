@@ -40,15 +40,16 @@ def encode(source: Path, out: Path | None, no_psnr: bool, as_json: bool, chosen:
         chosen = chosen.with_rate_of(source, plugins)
     resolved = chosen.resolve_one(plugins)
     session = open_session(resolved, plugins)
-    facts = (encode_directory if is_run else encode_ply)(session, resolved, source, target)
+    done = (encode_directory if is_run else encode_ply)(session, resolved, source, target)
+    facts = done.model_dump(mode="json")
     of = "its parameters as float32" if is_run else source.name
     facts["ratio"] = (facts["float32_bytes"] if is_run else source.stat().st_size) / facts["bytes"]
     ratio = facts["ratio"]
     told = f"{facts['bytes']:,} bytes, {max(ratio, 1 / ratio):.1f} x {'smaller' if ratio >= 1 else 'larger'} than {of}"
     if is_run and not no_psnr:
         measured = measure(session, resolved, opener(target, session), metrics=["psnr"], speed=False)
-        facts["psnr"] = measured["metrics"]["psnr"]["mean"]
-        told += "" if facts["psnr"] is None else f", PSNR {facts['psnr']:.2f} dB on {len(measured['views'])} test views"
+        facts["psnr"] = psnr = measured.metrics["psnr"].mean
+        told += "" if psnr is None else f", PSNR {psnr:.2f} dB on {len(measured.views)} test views"
     told += f", in {facts['encode_s']:.2f} s: {target}"
     shared.print_facts({"file": str(target), **facts}, as_json, told)
 
@@ -77,6 +78,6 @@ def decode(file: Path, out: Path | None, repeats: int, as_json: bool, chosen: Ch
     model, facts = timed_decode(file, session, repeats=repeats)
     if out is not None:
         save_decoded(model, facts, out, plugins)
-        facts["out"] = str(out)
-    told = f"{shared.counted(facts['counts'])}, decoded in {facts['decode_s']:.3f} s on {facts['device']}"
-    shared.print_facts(facts, as_json, f"{facts['method']}: {told}\nmodel digest {facts['digest']}")
+    printed = facts.model_dump(mode="json") | ({} if out is None else {"out": str(out)})
+    told = f"{shared.counted(facts.counts)}, decoded in {facts.decode_s:.3f} s on {facts.device}"
+    shared.print_facts(printed, as_json, f"{facts.method}: {told}\nmodel digest {facts.digest}")

@@ -81,15 +81,15 @@ def evaluate(
 
     def open_trained() -> Opened:
         with finished_training(session, resolved, file) as trained:
-            return Opened(trained.model.eval().requires_grad_(False), trained.facts["raster"])
+            return Opened(trained.model.eval().requires_grad_(False), trained.facts.raster)
 
     with contextlib.ExitStack() as stack:
         measured, digest = file, None
         if roundtrip:
             measured = stack.enter_context(scratch_folder("roundtrip")) / "scene.swz"
             encode_directory(session, resolved, file, measured)
-            digest = decode_fresh(measured, str(session.device), threads=resolved.ppl.threads)["digest"]
-        facts: dict[str, Any] = measure(
+            digest = decode_fresh(measured, str(session.device), threads=resolved.ppl.threads).digest
+        found = measure(
             session,
             resolved,
             open_trained if measured.is_dir() else opener(measured, session),
@@ -100,8 +100,9 @@ def evaluate(
             renders=renders,
         )
         size = None if measured.is_dir() else measured.stat().st_size
-    if digest not in (None, facts["digest"]):
+    if digest not in (None, found.digest):
         raise SplatwizardError(f"{file}: two processes decode different models from the same file")
+    facts = found.model_dump(mode="json", exclude={"asked"})
     shared.print_facts({"file": {"path": str(file), "bytes": size}, **facts}, as_json, _print)
 
 

@@ -51,7 +51,7 @@ def schedule(method: str, verbose: bool, as_json: bool, chosen: Choices) -> None
             found.append({
                 "stage": stage.name, "iterations": stage.iterations, "starts_from": stage.starts_from, "plan": plan,
                 "taught_by": list(stage.taught_by), "looked_up": list(stage.looked_up(None)),
-                "provided_by": stage_parts(origins, stage, resolved.ppl),
+                "provided_by": [part.model_dump() for part in stage_parts(origins, stage, resolved.ppl)],
             })  # fmt: skip
             continue
         own = origins.of(stage)

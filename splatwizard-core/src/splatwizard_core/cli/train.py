@@ -12,7 +12,7 @@ from splatwizard_core.cli import options as shared
 from splatwizard_core.cli.setup import Choices, only, open_training_session, takes_choices
 from splatwizard_core.plugins import load_plugins
 
-REPORTED = ("steps", "train_s", "stages", "peak_bytes", "memory_kind", "breakdown_s", "pretraining")
+REPORTED = {"steps", "train_s", "stages", "peak_bytes", "memory_kind", "breakdown_s", "pretraining"}
 
 
 @click.command(short_help="train one method on one scene")
@@ -36,6 +36,6 @@ def train(out: Path, resume: bool, allow_changed_plan: bool, as_json: bool, view
     resolved, session = open_training_session(chosen, plugins)
     trained, directory = train_only(session, RunRequest(only(resolved), out, resume, allow_changed_plan))
     facts: dict[str, Any] = {"directory": str(directory), "counts": trained.model.counts()}
-    facts |= {name: trained.facts[name] for name in REPORTED}
+    facts |= trained.facts.model_dump(mode="json", include=REPORTED)
     told = f"{facts['steps']:,} steps in {facts['train_s']:.1f} s, {shared.counted(facts['counts'])}: {directory}"
     shared.print_facts(facts, as_json, told)

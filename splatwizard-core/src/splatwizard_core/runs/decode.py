@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import statistics
-from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -20,8 +18,9 @@ from splatwizard_core.gaussians.sound import leave_out_senseless
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.method import Method
 from splatwizard_core.plugins import PluginManager
-from splatwizard_core.runs.contention import contention
+from splatwizard_core.runs.facts import DecodingFacts, contention
 from splatwizard_core.runs.file_needs import missing_plugin, other_versions, upgrade_command
+from splatwizard_core.runs.record import SpreadBlock
 from splatwizard_core.runs.session import Session
 from splatwizard_native import CoreTime, MemoryMeter, loading_time, replacing, synchronize, track, work_time
 
@@ -90,17 +89,8 @@ def _method_of(reader: ContainerReader, plugins: PluginManager) -> type[Method]:
     raise missing_plugin(reader, plugins, "method", name)
 
 
-def timed_decode(path: Path, session: Session, *, repeats: int = REPEATS) -> tuple[SplatModel, dict[str, Any]]:
+def timed_decode(path: Path, session: Session, *, repeats: int = REPEATS) -> tuple[SplatModel, DecodingFacts]:
     """Decode once untimed and `repeats` times timed, after every native module was loaded or compiled, timed apart.
-
-    Returns the model and facts about the file and its decoding, plain values. Among them
-
-    digest              of the model; equal models have equal digests
-    decode_s            median of `decode_runs_s`: from opening the file to a model on the device
-    decode_spread       how much the timed decodes differ; None for fewer than two
-    first_decode_s      of the decode before the timed ones, which imports what is imported late
-    jit_s               loading or compiling native modules; in no other figure
-    peak_bytes          memory growth over the first decode; `memory_kind` says of what
 
     Raises SplatwizardError if two decodes give different models.
     """
@@ -133,27 +123,27 @@ def timed_decode(path: Path, session: Session, *, repeats: int = REPEATS) -> tup
         raise SplatwizardError(
             f"{path}: two decodes give different models; method '{reader.method}' is not deterministic"
         )
-    return model, {
-        "method": reader.method,
-        "method_version": reader.version,
-        "digest": digest,
-        "counts": model.counts(),
-        "bytes": reader.size,
-        "sections": {"header": reader.header_bytes, **reader.sections},
-        "raster": reader.raster,
-        "decode_s": statistics.median(runs) if runs else first,
-        "decode_runs_s": runs,
-        "decode_spread": asdict(spread(runs)) if len(runs) > 1 else None,
-        "first_decode_s": first,
-        "jit_s": loading_time(),
-        "contended": contended,
-        "peak_bytes": peak,
-        "memory_kind": meter.kind,
-        "device": str(device),
-    }
+    return model, DecodingFacts(
+        method=reader.method,
+        method_version=reader.version,
+        digest=digest,
+        counts=model.counts(),
+        bytes=reader.size,
+        sections={"header": reader.header_bytes, **reader.sections},
+        raster=reader.raster,
+        decode_s=statistics.median(runs) if runs else first,
+        decode_runs_s=runs,
+        decode_spread=SpreadBlock(**asdict(spread(runs))) if len(runs) > 1 else None,
+        first_decode_s=first,
+        jit_s=loading_time(),
+        contended=contended,
+        peak_bytes=peak,
+        memory_kind=meter.kind,
+        device=str(device),
+    )
 
 
-def save_decoded(model: SplatModel, facts: Mapping[str, Any], path: Path, plugins: PluginManager) -> None:
+def save_decoded(model: SplatModel, facts: DecodingFacts, path: Path, plugins: PluginManager) -> None:
     """Keep a decoded model: `.safetensors` holds its tensors and says what they are, any other suffix is an exporter's.
 
     Raises UserInputError if no exporter writes such files.
@@ -164,7 +154,7 @@ def save_decoded(model: SplatModel, facts: Mapping[str, Any], path: Path, plugin
     from safetensors.torch import save_file
 
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()}
-    told = {"method": facts["method"], "digest": facts["digest"], "extra": json.dumps(model.state_dict_extra())}
+    told = {"method": facts.method, "digest": facts.digest, "extra": json.dumps(model.state_dict_extra())}
     with replacing(path) as temporary:
         save_file(tensors, temporary, metadata=told)
 

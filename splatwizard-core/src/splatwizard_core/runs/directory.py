@@ -8,15 +8,20 @@ import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+from pydantic import ValidationError
+
+from splatwizard_core.base.lock import directory_lock
 from splatwizard_core.errors import SceneError
 from splatwizard_core.runs.config import ResolvedConfig
-from splatwizard_core.runs.lock import directory_lock
 from splatwizard_core.runs.record import FILE_NAME
 from splatwizard_core.runs.session import Session
 from splatwizard_core.scene.images import check_pictures, decode_all
+from splatwizard_core.training.figures import Block
 from splatwizard_native import remove_folder, sweep, write_atomic, write_json
+
+FactsT = TypeVar("FactsT", bound=Block)
 
 STEPS = "steps.json"
 CHECKPOINTS = "checkpoints"
@@ -65,33 +70,36 @@ class StepLog:
             return {}
         return {k: v for k, v in content.items() if isinstance(v, dict) and {"key", "facts"} <= set(v)}
 
-    def done(self, step: str, key: str) -> dict[str, Any] | None:
+    def done(self, step: str, key: str, kind: type[FactsT]) -> FactsT | None:
         """Return the facts of a finished step, or None if it was not done from these inputs."""
         found = self._read().get(step)
-        return found["facts"] if found is not None and found["key"] == key else None
+        with contextlib.suppress(ValidationError):  # damaged: it is done again
+            return kind.model_validate(found["facts"]) if found is not None and found["key"] == key else None
+        return None
 
     def key_of(self, step: str) -> str | None:
         """Return the key of the inputs that a step was finished from; None if it was not."""
         found = self._read().get(step)
         return None if found is None else str(found["key"])
 
-    def finish(self, step: str, key: str, facts: dict[str, Any]) -> None:
+    def finish(self, step: str, key: str, facts: Block) -> None:
         """Remember a finished step."""
-        write_json(self.path, {**self._read(), step: {"key": key, "facts": facts}})
+        write_json(self.path, {**self._read(), step: {"key": key, "facts": facts.model_dump(mode="json")}})
 
     def once(
         self,
         step: str,
         key: str,
-        do: Callable[[], dict[str, Any]],
+        do: Callable[[], FactsT],
+        kind: type[FactsT],
         *,
-        holds: Callable[[dict[str, Any]], bool] = lambda facts: True,
-    ) -> dict[str, Any]:
+        holds: Callable[[FactsT], bool] = lambda facts: True,
+    ) -> FactsT:
         """Return the facts of a step as they are remembered; where they are not, do it and remember its facts.
 
         holds   facts of the same inputs -> they still hold what is asked for
         """
-        facts = self.done(step, key)
+        facts = self.done(step, key, kind)
         if facts is None or not holds(facts):
             facts = do()
             self.finish(step, key, facts)

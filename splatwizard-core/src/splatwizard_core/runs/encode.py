@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from splatwizard_core.base.lock import directory_lock
 from splatwizard_core.coding.container import ContainerWriter
 from splatwizard_core.coding.requirements import Requirement
 from splatwizard_core.errors import SplatwizardError, UserInputError
@@ -21,10 +22,9 @@ from splatwizard_core.plugins import Entry
 from splatwizard_core.plugins.catalogue import CORE
 from splatwizard_core.plugins.versions import made_by
 from splatwizard_core.runs.config import ResolvedConfig
-from splatwizard_core.runs.contention import contention
 from splatwizard_core.runs.decode import read_gaussians
 from splatwizard_core.runs.directory import RunRequest
-from splatwizard_core.runs.lock import directory_lock
+from splatwizard_core.runs.facts import EncodingFacts, contention
 from splatwizard_core.runs.phases import part_of, unique
 from splatwizard_core.runs.pretrained import make_method
 from splatwizard_core.runs.session import Session, TrainedModel
@@ -43,7 +43,7 @@ def encode(
     origin: Origin = NOWHERE,
     *,
     deterministic: bool = False,
-) -> dict[str, Any]:
+) -> EncodingFacts:
     """Write one file; returns the facts of the encoding, for the record and for what is done again later.
 
     raster          what the header asks of a rasterizer
@@ -70,15 +70,15 @@ def encode(
     seconds, contended = work_time() - began, contention("encode", cores)
     if model.digest() != before:
         raise SplatwizardError(f"method '{method.name}' changed the model while encoding it, which it may not")
-    return {
-        "encode_s": seconds,
-        "float32_bytes": 4 * sum(values.numel() for values in model.parameters()),
-        "contended": contended,
-        "bytes": size,
-        "sha256": file_sha256(path),
-        "made_by": made_by(method.plugins, loaded),
-        "parts": unique(part_of(entry) for entry in loaded),
-    }
+    return EncodingFacts(
+        encode_s=seconds,
+        float32_bytes=4 * sum(values.numel() for values in model.parameters()),
+        contended=contended,
+        bytes=size,
+        sha256=file_sha256(path),
+        made_by=made_by(method.plugins, loaded),
+        parts=unique(part_of(entry) for entry in loaded),
+    )
 
 
 def requirements(entries: Iterable[Entry]) -> list[Requirement]:
@@ -108,15 +108,15 @@ def finished_training(session: Session, resolved: ResolvedConfig, directory: Pat
         yield train(session, request, directory)
 
 
-def encode_directory(session: Session, resolved: ResolvedConfig, directory: Path, target: Path) -> dict[str, Any]:
+def encode_directory(session: Session, resolved: ResolvedConfig, directory: Path, target: Path) -> EncodingFacts:
     """Encode the finished training of a run directory. Raises UserInputError if it is not finished."""
     with finished_training(session, resolved, directory) as trained:
-        method, raster = make_method(session.plugins, resolved), trained.facts["raster"]
+        method, raster = make_method(session.plugins, resolved), trained.facts.raster
         origin = session.scene(resolved).origin
         return encode(method, trained.model, raster, target, origin, deterministic=resolved.ppl.deterministic)
 
 
-def encode_ply(session: Session, resolved: ResolvedConfig, path: Path, target: Path) -> dict[str, Any]:
+def encode_ply(session: Session, resolved: ResolvedConfig, path: Path, target: Path) -> EncodingFacts:
     """Encode the explicit Gaussians of a .ply. Raises UserInputError for methods that do not encode such."""
     if session.plugins.importers.of_suffix(path) is None:
         raise UserInputError(f"{path}: `sw encode` takes a run directory or a .ply")

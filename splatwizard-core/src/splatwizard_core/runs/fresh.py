@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from splatwizard_core.errors import SplatwizardError, UserInputError
+from splatwizard_core.runs.facts import DecodingFacts
 from splatwizard_native import scratch_folder
 
 HIDDEN = ("SPLATWIZARD_DATA", "SPLATWIZARD_TEST_DATA")
@@ -61,7 +62,7 @@ def run_fresh(arguments: Sequence[str], *, alone_in: Path | None = None, told: C
     raise FreshProcessError(f"`{name}` in a fresh process did not print a JSON object: {done.stdout[:200]!r}")
 
 
-def decode_fresh(path: Path, device: str, *, repeats: int = 3, threads: int = 0) -> dict[str, Any]:
+def decode_fresh(path: Path, device: str, *, repeats: int = 3, threads: int = 0) -> DecodingFacts:
     """Decode a file where there is nothing else: an empty folder that holds only the file, no data set in sight.
 
     repeats     timed decodes
@@ -71,4 +72,5 @@ def decode_fresh(path: Path, device: str, *, repeats: int = 3, threads: int = 0)
         copy = folder / path.name
         shutil.copyfile(path, copy)
         arguments = ["decode", copy.name, "--device", device, "--repeats", str(repeats), "--json"]
-        return run_fresh([*arguments, "--set", f"threads={threads}"], alone_in=folder)
+        told = run_fresh([*arguments, "--set", f"threads={threads}"], alone_in=folder)
+        return DecodingFacts.model_validate(told)

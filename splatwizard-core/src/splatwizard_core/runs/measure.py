@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -14,17 +15,17 @@ from splatwizard_core.evaluation.metrics import MetricSetup, chosen_metrics
 from splatwizard_core.evaluation.speed import SpeedReport, measure_speed
 from splatwizard_core.gaussians.placement import placed_in
 from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.plugins import PluginManager
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.runs.config import ResolvedConfig
-from splatwizard_core.runs.contention import contention
 from splatwizard_core.runs.decode import import_method, open_model, read_gaussians
-from splatwizard_core.runs.environment import describe_environment
-from splatwizard_core.runs.record import MemoryBlock, MetricBlock, SpeedBlock, picked
+from splatwizard_core.runs.facts import Measurement, contention
+from splatwizard_core.runs.record import MemoryBlock, MetricBlock, ProtocolBlock, SpeedBlock
 from splatwizard_core.runs.session import Session
 from splatwizard_core.runs.training_views import training_psnr
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import Scene
-from splatwizard_native import CoreTime, MemoryMeter, loading_time, synchronize, work_time
+from splatwizard_native import CoreTime, MemoryMeter, describe_machine, loading_time, synchronize, work_time
 
 FEWEST_SPEED_VIEWS = 8
 
@@ -53,8 +54,8 @@ def measure(
     speed: bool = True,
     repeats: int = 1,
     renders: Path | None = None,
-) -> dict[str, Any]:
-    """Open a model, then its scene, and measure the one on the other. Plain values, as `sw eval --json` prints them.
+) -> Measurement:
+    """Open a model, then its scene, and measure the one on the other.
 
     resolved    with the scene, the settings of metrics, and the choice of rasterizers
     open_model  () -> the model on the session's device; called first, before any picture is read
@@ -121,32 +122,10 @@ def measure(
     of_training, reasons = None, {"training_psnr": "not asked for (eval_train, --metrics)"}
     if metrics is None and resolved.ppl.eval_train:  # last: the pictures are read for it alone
         of_training, reasons = training_psnr(scene, draw(rasterizer), device)
-    found = {
-        "dataset": scene.protocol.dataset,
-        "scene": scene.name,
-        "scene_warnings": list(scene.warnings),
-        "scene_origin": list(scene.origin),
-        "protocol": {"id": scene.protocol.id, **asdict(scene.protocol)},
-        "train_views": len(scene.train),
-        "test_views": len(views),
-        **vars(result),
-        "metrics": {name: picked(MetricBlock, asdict(metric)) for name, metric in results},
-        "geometry": {name: dict(m.details) for name, m in of_model.items()} or None,
-        "training_psnr": of_training,
-        "unknown": {f"metrics.{name}.mean": m.reason for name, m in results if m.reason is not None} | reasons,
-        "digest": model.digest(),
-        "counts": model.counts(),
-        "speed": None,
-        "memory": None,
-        "rasterizers": dict(rasterizer.choices),
-        "raster": quality.raster_header(rasterizer.decided(options)),
-        "environment": describe_environment(plugins, device, resolved.ppl.seed),
-        "contended": contended,
-        "flags": _flags(scene, result, meter, device_bound=device_bound, bad_rows=bad_rows, contended=bool(contended)),
-    }
+    speeds, memory = None, None
     if report is not None:
         first = speed_views[0].camera
-        measured = asdict(report) | {
+        told = asdict(report) | drawn | {
             "jit_s": loading_time(),
             "prepare_s": prepare_s,
             "load_s": open_s + prepare_s + report.first_frame_s,
@@ -155,9 +134,42 @@ def measure(
             "model_bytes": model_bytes,
             "peak_load_bytes": peak_load,
             "peak_render_bytes": report.peak_bytes + (0 if report.memory_kind == "cuda" else model_bytes),
-        }
-        found |= {"speed": picked(SpeedBlock, measured, drawn), "memory": picked(MemoryBlock, measured)}
-    return found
+        }  # fmt: skip
+        speeds, memory = SpeedBlock.model_validate(told), MemoryBlock.model_validate(told)
+    return Measurement(
+        dataset=scene.protocol.dataset,
+        scene=scene.name,
+        scene_warnings=list(scene.warnings),
+        scene_origin=scene.origin,
+        protocol=ProtocolBlock.model_validate({"id": scene.protocol.id, **asdict(scene.protocol)}),
+        train_views=len(scene.train),
+        test_views=len(views),
+        views=result.views,
+        metrics={name: MetricBlock.model_validate(asdict(metric)) for name, metric in results},
+        visible_gaussians=result.visible_gaussians,
+        drawn_gaussians=result.drawn_gaussians,
+        renders=result.renders,
+        geometry={name: dict(m.details) for name, m in of_model.items()} or None,
+        training_psnr=of_training,
+        unknown={f"metrics.{name}.mean": m.reason for name, m in results if m.reason is not None} | reasons,
+        digest=model.digest(),
+        counts=model.counts(),
+        speed=speeds,
+        memory=memory,
+        rasterizers=dict(rasterizer.choices),
+        raster=quality.raster_header(rasterizer.decided(options)),
+        environment=_environment(plugins, device, resolved.ppl.seed),
+        contended=contended,
+        flags=_flags(scene, result, meter, device_bound=device_bound, bad_rows=bad_rows, contended=bool(contended)),
+    )
+
+
+def _environment(plugins: PluginManager, device: torch.device, seed: int) -> dict[str, Any]:
+    """Return plain values for the record: no machine name, no path, no user."""
+    packages = {p.distribution: p.version for p in plugins.plugins}
+    for name in ("torch", "numpy"):
+        packages[name] = importlib.metadata.version(name)
+    return {"packages": packages, "seed": seed, **describe_machine(device)}
 
 
 def _flags(

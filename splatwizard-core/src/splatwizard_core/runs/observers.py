@@ -20,7 +20,7 @@ from splatwizard_core.runs.record import Record
 from splatwizard_core.scene.scene import Scene
 from splatwizard_core.training.housekeeping import OnStep
 from splatwizard_core.training.params import LogParams
-from splatwizard_core.training.trainer import StepRecord
+from splatwizard_core.training.state import TrainingState
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -49,8 +49,8 @@ class StartedTraining:
 class TrainingObserver(Protocol):
     """Watches a training between its steps; its time is not the training's. One that raises is told and dropped."""
 
-    def after_step(self, model: SplatModel, record: StepRecord) -> None:
-        """Called after each step; must leave the model, its gradients and all random streams as they are."""
+    def after_step(self, model: SplatModel, state: TrainingState) -> None:
+        """Called after each step; must leave the training, its gradients and all random streams as they are."""
         ...
 
     def finished(self) -> None:
@@ -82,8 +82,8 @@ def watched_by(
                 with contextlib.suppress(Exception, SystemExit):
                     observer.finished()
 
-    def after_step(model: SplatModel, record: StepRecord) -> None:
-        tell(lambda observer: observer.after_step(model, record))
+    def after_step(model: SplatModel, state: TrainingState) -> None:
+        tell(lambda observer: observer.after_step(model, state))
 
     try:
         yield after_step if watching else None

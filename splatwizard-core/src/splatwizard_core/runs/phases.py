@@ -1,6 +1,6 @@
 """Providers of each phase of a run, with their versions: of each training stage, encoding, rendering, evaluating.
 
-A part is {"kind", "name", "distribution", "version"}. Kinds are those of the registries ("rasterizer", "pruner",
+Kinds of a part are those of the registries ("rasterizer", "pruner",
 "coder", ...) and "stage", a training stage by the distribution of its class: a method that takes over another's stage
 shows there. A task is listed where it comes from another distribution than its stage.
 """
@@ -9,36 +9,37 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any
 
 from splatwizard_core.plugins import Entry, PluginManager
 from splatwizard_core.plugins.origins import NOBODY, Origins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
+from splatwizard_core.runs.facts import EncodingFacts, Measurement, TrainingFacts
+from splatwizard_core.runs.record import PhaseBlock
+from splatwizard_core.training.figures import Provided
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.scheduler import build_schedulers
 from splatwizard_core.training.stage import Stage
 
-Part = dict[str, str]
 TRAIN, ENCODE, RENDER, EVALUATE = "train", "encode", "render", "evaluate"
 
 
-def part_of(entry: Entry) -> Part:
+def part_of(entry: Entry) -> Provided:
     """Return a registry entry as a part."""
     return _part(entry.kind, entry.name, entry.distribution, entry.version)
 
 
-def unique(parts: Iterable[Part]) -> list[Part]:
+def unique(parts: Iterable[Provided]) -> list[Provided]:
     """Return each part once, in the order in which they first came."""
-    return list({tuple(part.values()): part for part in parts}.values())
+    return list(dict.fromkeys(parts))
 
 
-def named_parts(plugins: PluginManager, kind: str, names: Iterable[str]) -> list[Part]:
+def named_parts(plugins: PluginManager, kind: str, names: Iterable[str]) -> list[Provided]:
     """Return things of a kind, given by name, as parts; one that is not installed any more has no distribution."""
     known = plugins.registries[kind]
     return unique(part_of(known.entry(name)) if name in known else _part(kind, name) for name in names)
 
 
-def stage_parts(origins: Origins, stage: Stage, ppl: PipelineParams) -> list[Part]:
+def stage_parts(origins: Origins, stage: Stage, ppl: PipelineParams) -> list[Provided]:
     """Return the stage itself, and the tasks of its plan that come from elsewhere."""
     own = origins.of(stage)
     planned = [each for scheduler in build_schedulers(stage, ppl) for each in scheduler.registrations]
@@ -66,15 +67,15 @@ class StageParts:
         self._plugins, self._loaded, self._rasterizer = plugins, loaded, rasterizer
         origins = Origins(plugins)
         self._fixed = [stage_parts(origins, stage, ppl) for stage in stages]
-        self._common: list[Part] = []
+        self._common: list[Provided] = []
         for entry in _without_methods(loaded):
             holders = [parts for stage, parts in zip(stages, self._fixed, strict=True) if _holds(stage, entry)]
             for parts in holders or [self._common]:
                 parts.append(part_of(entry))
         self._mark = len(loaded)
-        self._pending: list[Part] = []
+        self._pending: list[Provided] = []
 
-    def since_asked(self) -> list[Part]:
+    def since_asked(self) -> list[Provided]:
         """Return the parts that served since this was last asked."""
         asked = map(part_of, _without_methods(self._loaded[self._mark :]))
         drawn = named_parts(self._plugins, "rasterizer", sorted(self._rasterizer.served))
@@ -90,7 +91,7 @@ class StageParts:
         yield
         self._mark = len(self._loaded)
 
-    def phases(self, provided: Mapping[str, Sequence[Part]]) -> list[dict[str, Any]]:
+    def phases(self, provided: Mapping[str, Sequence[Provided]]) -> list[PhaseBlock]:
         """Return the phases of the training.
 
         provided    stage name -> the parts that `since_asked` told during it
@@ -101,24 +102,24 @@ class StageParts:
 
 
 def phases_of_run(
-    plugins: PluginManager, training: Mapping[str, Any], encoding: Mapping[str, Any], measured: Mapping[str, Any]
-) -> list[dict[str, Any]]:
+    plugins: PluginManager, training: TrainingFacts, encoding: EncodingFacts, measured: Measurement
+) -> list[PhaseBlock]:
     """Return all phases of a run from the facts of its steps."""
-    computed = (n for n, m in measured["metrics"].items() if m["per_view"] or m["mean"] is not None)
+    computed = (name for name, m in measured.metrics.items() if m.per_view or m.mean is not None)
     return [
-        *training["phases"],
-        _phase(ENCODE, encoding["parts"]),
-        _phase(RENDER, named_parts(plugins, "rasterizer", measured["rasterizers"].values())),
+        *training.phases,
+        _phase(ENCODE, encoding.parts),
+        _phase(RENDER, named_parts(plugins, "rasterizer", measured.rasterizers.values())),
         _phase(EVALUATE, named_parts(plugins, "metric", computed)),
     ]
 
 
-def _phase(name: str, parts: Iterable[Part]) -> dict[str, Any]:
-    return {"phase": name, "provided_by": unique(parts)}
+def _phase(name: str, parts: Iterable[Provided]) -> PhaseBlock:
+    return PhaseBlock(phase=name, provided_by=unique(parts))
 
 
-def _part(kind: str, name: str, distribution: str = "", version: str = "") -> Part:
-    return {"kind": kind, "name": name, "distribution": distribution, "version": version}
+def _part(kind: str, name: str, distribution: str = "", version: str = "") -> Provided:
+    return Provided(kind=kind, name=name, distribution=distribution, version=version)
 
 
 def _without_methods(entries: Iterable[Entry]) -> list[Entry]:

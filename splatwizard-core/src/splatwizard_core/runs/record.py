@@ -1,91 +1,67 @@
 """The result record, metrics.json, that every table is made from. A versioned schema; unknown values are null.
 
 A value that is null has its reason in `unknown`, by dotted name; no value is ever 0 for "not measured".
-A field is added here and where it is measured: `picked` carries it into the record, `WhyNull` says why it may be null.
+A field is declared here (or in `training.figures`) and filled where it is measured. From the declaration follow why it
+may be null (`WhyNull`), its row of docs/protocol.md (tools/record_docs.py), what readers of other releases' records
+take, and with `Shown` its row in the report.
 Source: evaluation protocol, result record.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field, ValidationError
 
 from splatwizard_core.errors import SplatwizardError, UserInputError
+from splatwizard_core.training.figures import Block, LoopFigures, MemoryKind, Provided, Shown, StagePlan, WhyNull
 from splatwizard_native import load_strict, write_atomic
 
-SCHEMA: Literal[3] = 3
+SCHEMA = 3
 FILE_NAME = "metrics.json"
 DESCRIBED_ELSEWHERE = ("config", "environment")  # fields whose nulls need no reason here
-
-
-@dataclass(frozen=True)
-class WhyNull:
-    """Marks a field with the reason of its null, where whoever measured it told none."""
-
-    reason: str
-
-
 OF_A_FILE = WhyNull("it came from a file, which does not say")
+Score = Annotated[float, Field(ge=-1e12, le=1e12)]
+"""Value of a metric, with room for sums, means and slopes."""
 
 
-class Part(BaseModel):
-    """Base of the record's blocks: nothing unknown, nothing that is not a number."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-def picked(block: type[Part], *sources: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values of a block's fields, each from the last source that has it.
-
-    None for one that no source has, unless it has a default; whatever else the sources hold is left out.
-    """
-    merged: dict[str, Any] = {}
-    for source in sources:
-        merged |= source
-    return {
-        name: merged.get(name) for name, field in block.model_fields.items() if name in merged or field.is_required()
-    }
-
-
-class ProtocolBlock(Part):
+class ProtocolBlock(Block):
     """The rules that make results comparable: only equal ids may stand in one table. Later rules may stand beside."""
 
-    model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="allow")
 
     id: str
-    dataset: str
-    images: str = Field(description="picture folder")
-    resolution: int = Field(description="-1 (1600 px rule), 1, 2, 4, 8, or a width in pixels")
-    split: str
-    background: str
-    principal_point: str
-    quantize8: bool = Field(description="renders were rounded to 8 bit before comparing")
+    dataset: str = ""
+    images: str = Field("", description="picture folder")
+    resolution: int = Field(-1, description="-1 (1600 px rule), 1, 2, 4, 8, or a width in pixels")
+    split: str = ""
+    background: str = ""
+    principal_point: str = ""
+    quantize8: bool = Field(True, description="renders were rounded to 8 bit before comparing")
 
 
-class MetricBlock(Part):
+class MetricBlock(Block):
     """One image metric over the test views, or one of the model itself: without `per_view`, details in `geometry`."""
 
-    mean: float | None
-    per_view: list[float | None] = Field(description="in the order of `views`; null: not finite, as `unknown` says")
-    direction: Literal["higher", "lower"]
+    mean: Score | None = Field(None, description="over the test views")
+    per_view: list[Score | None] = Field([], description="in the order of `views`; null: not finite, see `unknown`")
+    direction: str = Field("higher", description="higher or lower is better")
     diagnostic: bool = Field(False, description="computed to tell conventions apart, not for tables")
     made_with: dict[str, str] = Field({}, description="what else the values depend on: versions, weights, checksums")
 
 
-class TrainingPsnrBlock(Part):
+class TrainingPsnrBlock(Block):
     """PSNR of the decoded model over its training views, dB, by the rules of the test views."""
 
-    mean: float | None
-    median: float | None
-    quantile_05: float | None = Field(description="5 % of the views have this or less")
-    far_below: dict[str, float] = Field(description="views more than 8 dB below the median, the lowest first")
+    mean: float | None = None
+    median: float | None = None
+    quantile_05: float | None = Field(None, description="5 % of the views have this or less")
+    far_below: dict[str, float] = Field({}, description="views more than 8 dB below the median, the lowest first")
 
 
-class SpreadBlock(Part):
+class SpreadBlock(Block):
     """Spread of repeated measurements of one thing."""
 
     n: int = Field(ge=2, description="measurements")
@@ -95,163 +71,173 @@ class SpreadBlock(Part):
     max: float
 
 
-class SpeedBlock(Part):
+class SpeedBlock(Block):
     """Rendering, by the FPS protocol, of the model decoded from the file."""
 
-    fps: float
-    latency_ms_median: float
-    latency_ms_p95: float
-    jit_s: float | None = Field(description="loading or compiling native modules; in no other figure")
-    prepare_s: float = Field(description="view-independent caches, built once, not in `fps`")
-    load_s: float | None = Field(description="from opening the file to the first frame; without `jit_s`")
-    frames: int = Field(description="measured, over all repeats")
-    rounds: int = Field(description="over all views, in each repeat")
-    repeats: int
-    views: int
-    warmup_frames: int
+    fps: float | None = Field(None, description="frames per second")
+    latency_ms_median: float | None = None
+    latency_ms_p95: float | None = None
+    jit_s: float | None = Field(None, description="loading or compiling native modules; in no other figure")
+    prepare_s: float | None = Field(None, description="view-independent caches, built once, not in `fps`")
+    load_s: float | None = Field(None, description="from opening the file to the first frame; without `jit_s`")
+    frames: int | None = Field(None, description="measured, over all repeats")
+    rounds: int | None = Field(None, description="over all views, in each repeat")
+    repeats: int | None = None
+    views: int | None = None
+    warmup_frames: int | None = Field(None, description="drawn before the clock starts")
     spread: Annotated[dict[str, SpreadBlock] | None, WhyNull("measured once (--repeats N)")] = Field(
-        description="of fps and the latencies over the repeats"
+        None, description="of fps and the latencies over the repeats"
     )
-    image_size: tuple[int, int] = Field(description="width, height of the first view drawn")
+    image_size: tuple[int, int] | None = Field(None, description="width, height of the first view drawn")
     drawn_by: dict[str, str] = Field({}, description="rasterizers that drew the frames -> whose kernels those are")
     default_fps: dict[str, float] = Field(
         {}, description="`fps` by the kernels that draw where a file names none; empty: those drew the frames"
     )
 
 
-class MemoryBlock(Part):
+class MemoryBlock(Block):
     """Bytes; `kind` says what was measured: "cuda" (torch's allocator) or "rss" (growth of the resident set)."""
 
-    kind: Literal["cuda", "rss"]
-    model_bytes: int = Field(description="held after the model was decoded and prepared")
-    peak_load_bytes: int | None = Field(description="peak from opening the file to the decoded model")
-    peak_render_bytes: int = Field(description="peak over the measured frames, the model included")
+    kind: MemoryKind | None = Field(None, description="what was measured")
+    model_bytes: int | None = Field(None, description="held after the model was decoded and prepared")
+    peak_load_bytes: int | None = Field(None, description="peak from opening the file to the decoded model")
+    peak_render_bytes: int | None = Field(None, description="peak over the measured frames, the model included")
     peak_reserved_bytes: Annotated[int | None, WhyNull("a CPU has no such pool")] = None
 
 
-class StageBlock(Part):
+class StageBlock(Block):
     """One training stage, or what a stage started from."""
 
     name: str
     seconds: float
 
 
-class PretrainingBlock(Part):
+class PretrainingBlock(Block):
     """The trained scene of another method that a training started from, or was taught by."""
 
-    file: dict[str, str] = Field(description="name and sha256 of the .ply that it came from; empty: trained here")
-    preset: Annotated[str | None, OF_A_FILE]
-    config: Annotated[dict[str, Any] | None, OF_A_FILE] = Field(description="every value of the method that trained it")
-    steps: Annotated[int | None, OF_A_FILE]
-    train_s: Annotated[float | None, OF_A_FILE] = Field(description="with what it started from itself")
-    made_by: dict[str, str] = Field(description="distribution -> version")
+    file: dict[str, str] = Field({}, description="name and sha256 of the .ply that it came from; empty: trained here")
+    preset: Annotated[str | None, OF_A_FILE] = None
+    config: Annotated[dict[str, Any] | None, OF_A_FILE] = Field(
+        None, description="every value of the method that trained it"
+    )
+    steps: Annotated[int | None, OF_A_FILE] = None
+    train_s: Annotated[float | None, OF_A_FILE] = Field(None, description="with what it started from itself")
+    made_by: dict[str, str] = Field({}, description="distribution -> version")
 
 
-class TrainBlock(Part):
+class TrainBlock(LoopFigures):
     """Training: wall clock of the loop without evaluation, checkpoints and loading."""
 
-    train_s: float | None
-    stages: list[StageBlock]
+    train_s: float | None = Field(None, description="of all stages")
+    stages: list[StageBlock] = Field([], description="seconds of each")
     with_pretraining_s: Annotated[float | None, WhyNull("a scene that it started from came from a file")] = Field(
-        description="with the training of the scenes it starts from"
+        None, description="with the training of the scenes it starts from"
     )
-    pretraining: dict[str, PretrainingBlock] = Field(description="method -> its scene that this one used")
-    steps: int | None
-    peak_bytes: Annotated[int | None, WhyNull("not measured")] = Field(
-        description="over the loop; without evaluation and checkpoints since schema 2"
-    )
-    memory_kind: Literal["cuda", "rss"] | None
-    pictures_in: str = Field(description="where the training pictures lay: host, cuda")
-    breakdown_s: Annotated[dict[str, dict[str, float]] | None, WhyNull("not profiled (--set profile=stages)")] = Field(
-        description="stage -> part of a step -> seconds, if profiled"
-    )
-    trained_in: str | None = Field(description="rate point whose training this one shares (its own, as a rule)")
+    pretraining: dict[str, PretrainingBlock] = Field({}, description="method -> its scene that this one used")
+    steps: int | None = None
+    trained_in: str | None = Field(None, description="rate point whose training this one shares (its own, as a rule)")
 
 
-class CodecBlock(Part):
+class DecodeFigures(Block):
+    """Decoding in a fresh process, wall clock, device synchronised."""
+
+    decode_s: Annotated[float | None, Shown("decoding", "s")] = Field(None, description="median, fresh process")
+    decode_runs_s: list[float] = Field([], description="of each timed decode")
+    decode_spread: SpreadBlock | None = None
+    first_decode_s: float | None = Field(None, description="the untimed decode before them: late imports included")
+    jit_s: float | None = Field(None, description="loading or compiling native modules; in no other figure")
+    memory_kind: MemoryKind | None = None
+
+
+class CodecBlock(DecodeFigures):
     """Encoding and decoding, wall clock, device synchronised."""
 
-    encode_s: float | None
-    decode_s: float = Field(description="median of the timed decodes")
-    decode_runs_s: list[float]
-    decode_spread: SpreadBlock | None
-    first_decode_s: float = Field(description="the untimed decode before them: late imports included")
-    jit_s: float | None = Field(description="loading or compiling native modules; in no other figure")
-    peak_decode_bytes: int
-    memory_kind: Literal["cuda", "rss"]
+    encode_s: Annotated[float | None, Shown("encoding", "s")] = Field(None, description="to the closed file")
+    peak_decode_bytes: Annotated[int | None, Shown("decoding memory", "bytes")] = Field(
+        None, description="growth over the first decode"
+    )
 
 
-class RecordFile(Part):
+class RecordFile(Block):
     """The encoded file."""
 
     bytes: int = Field(gt=0, description="size of the single file")
-    sha256: str
-    sections: dict[str, int] = Field(description="bytes by section, header included; they sum to `bytes`")
-    digest: str = Field(description="SHA-256 of the decoded model, equal in the decoding and the evaluating process")
+    sha256: str | None = None
+    sections: dict[str, Annotated[int, Field(ge=0)]] = Field(
+        {}, description="bytes by section, header included; they sum to `bytes`"
+    )
+    digest: str | None = Field(
+        None, description="SHA-256 of the decoded model, equal in the decoding and the evaluating process"
+    )
 
 
-class ProvidedBlock(Part):
-    """A part that served: a registered thing by kind and name, a training `stage`, or a `task` of another package."""
-
-    kind: str
-    name: str
-    distribution: str = Field(description="pip distribution; empty: of none that is installed")
-    version: str
-
-
-class PhaseBlock(Part):
+class PhaseBlock(Block):
     """One phase of a run."""
 
     phase: str = Field(
         description='"train: NAME" (a stage), "train" (before the first), "encode", "render", "evaluate"'
     )
-    provided_by: list[ProvidedBlock]
+    provided_by: list[Provided] = []
 
 
-class Record(Part):
-    """One scene, one method, one rate point, one file."""
+class Quality(Block):
+    """What measuring a model on a scene tells, in `sw eval` and in the record alike."""
 
-    schema_version: Literal[3] = SCHEMA
-    method: str
-    method_version: int
-    distribution: str = Field(description="pip distribution and version that the method comes from")
-    preset: str | None
-    rate: str | None
-    config: dict[str, Any] | None = Field(description="every value, by block, and where each was set")
-    config_hash: str | None
-    dataset: str
-    scene: str
+    dataset: str = Field("unknown", description="family of the scene")
+    scene: str = Field(min_length=1)
     scene_warnings: list[str] = Field([], description="what was found in the scene and not used as it stands")
     scene_origin: tuple[float, float, float] = Field(
         (0.0, 0.0, 0.0), description="where the origin of model and cameras lies in the world of the scene's files"
     )
     protocol: ProtocolBlock
-    train_views: int
-    test_views: int
-    views: list[str] = Field(description="names of the test views")
+    train_views: int | None = None
+    test_views: int | None = None
+    views: list[str] = Field([], description="names of the test views")
     metrics: dict[str, MetricBlock]
-    file: RecordFile
-    counts: dict[str, int] = Field(description="num_gaussians, num_anchors, ... after decoding")
-    visible_gaussians: float = Field(description="mean over the test views of those with radius > 0")
-    codec: CodecBlock
-    speed: SpeedBlock
-    memory: MemoryBlock
-    train: TrainBlock
-    geometry: Annotated[dict[str, dict[str, Any]] | None, WhyNull("not asked for")] = None
-    training_psnr: Annotated[TrainingPsnrBlock | None, WhyNull("not measured")] = None
-    plan: list[dict[str, Any]] = Field(description="of each stage its name, steps, tasks, and `looked_up`")
-    rasterizers: dict[str, dict[str, str]] = Field(description="phase -> features asked for -> who served them")
-    raster_options: dict[str, dict[str, Any]] = Field(
-        {}, description="phase -> options of drawing that are not the defaults: profile, antialias, eps2d, clamp_color"
+    counts: dict[str, int] = Field({}, description="num_gaussians, num_anchors, ... after decoding")
+    visible_gaussians: Annotated[float | None, Shown("visible primitives")] = Field(
+        None, description="mean over the test views of those with radius > 0"
     )
-    phases: list[PhaseBlock] = Field(description="who served each phase, with distribution and version")
-    environment: dict[str, Any]
+    geometry: Annotated[dict[str, dict[str, Any]] | None, WhyNull("not asked for")] = Field(
+        None, description="by metric over the model its protocol, and what its value consists of"
+    )
+    training_psnr: Annotated[TrainingPsnrBlock | None, WhyNull("not measured")] = None
+    environment: dict[str, Any] = Field({}, description="packages, device, driver, clocks, threads, seed")
     contended: dict[str, float] = Field(
         {}, description="train, encode, decode, render: those that had to share the cores -> the share that they had"
     )
-    flags: list[str] = Field(description="fit, rss, ...")
-    unknown: dict[str, str] = Field(description="dotted name of each null -> why")
-    date: str = Field(description="ISO 8601, UTC")
+    flags: list[str] = Field(
+        [],
+        description="what a reader of the numbers must know: `fit`, `rss`, `infinite`, `not-a-number`, "
+        "`unverified-weights`, `device-bound` (the file decodes only on the machine that made it), `non-finite-rows` "
+        "(rows with NaN or infinities, not drawn), `contended`",
+    )
+    unknown: dict[str, str] = Field({}, description="dotted name of each null -> why")
+
+
+class Record(Quality):
+    """One scene, one method, one rate point, one file."""
+
+    schema_version: int = Field(SCHEMA, strict=True)
+    method: str = Field(min_length=1, description="name that it is registered under")
+    method_version: int | None = Field(None, description="version of its file layout")
+    distribution: str | None = Field(None, description="pip distribution and version that the method comes from")
+    preset: str | None = None
+    rate: str | None = None
+    config: dict[str, Any] | None = Field(None, description="every value, by block, and where each was set")
+    config_hash: str | None = Field(None, description="SHA-256 over every given value")
+    file: RecordFile
+    codec: CodecBlock = CodecBlock()
+    speed: SpeedBlock = SpeedBlock()
+    memory: MemoryBlock = MemoryBlock()
+    train: TrainBlock = TrainBlock()
+    plan: list[StagePlan] = Field([], description="the executed plan of each stage")
+    rasterizers: dict[str, dict[str, str]] = Field({}, description="phase -> features asked for -> who served them")
+    raster_options: dict[str, dict[str, Any]] = Field(
+        {}, description="phase -> options of drawing that are not the defaults: profile, antialias, eps2d, clamp_color"
+    )
+    phases: list[PhaseBlock] = Field([], description="who served each phase, with distribution and version")
+    date: str | None = Field(None, description="ISO 8601, UTC")
 
     def write(self, path: Path) -> None:
         """Write it, atomically."""
@@ -261,7 +247,7 @@ class Record(Part):
 def read_record(path: Path) -> Record:
     """Return a record from its file. Raises UserInputError that names what is wrong first."""
     try:
-        return Record.model_validate(load_strict(path.read_bytes()))
+        record = Record.model_validate(load_strict(path.read_bytes()))
     except OSError as error:
         raise UserInputError(f"{path}: cannot be read: {error.strerror}") from error
     except ValidationError as error:
@@ -270,6 +256,10 @@ def read_record(path: Path) -> Record:
         raise UserInputError(f"{path}: not a result record of schema {SCHEMA}: {where}: {first['msg']}") from None
     except ValueError as error:
         raise UserInputError(f"{path}: not a result record of schema {SCHEMA}: {error}") from None
+    if record.schema_version != SCHEMA:
+        told = f"schema_version: it is {record.schema_version}"
+        raise UserInputError(f"{path}: not a result record of schema {SCHEMA}: {told}")
+    return record
 
 
 def complete_record(values: Mapping[str, Any]) -> Record:
@@ -289,12 +279,12 @@ def missing_reasons(record: Record) -> list[str]:
     return [name for name, _ in _nulls(record) if name not in record.unknown]
 
 
-def _nulls(values: Part | dict[str, Any], prefix: str = "") -> Iterator[tuple[str, WhyNull | None]]:
+def _nulls(values: Block | dict[str, Any], prefix: str = "") -> Iterator[tuple[str, WhyNull | None]]:
     """Yield the dotted name of each null, and the mark of its field; not what blocks hold that others describe."""
-    fields = type(values).model_fields if isinstance(values, Part) else {}
+    fields = type(values).model_fields if isinstance(values, Block) else {}
     for name, value in values.items() if isinstance(values, dict) else values:
         if value is None:
             marks = fields[name].metadata if name in fields else []
             yield prefix + name, next((mark for mark in marks if isinstance(mark, WhyNull)), None)
-        elif isinstance(value, Part | dict) and not (isinstance(values, Part) and name in DESCRIBED_ELSEWHERE):
+        elif isinstance(value, Block | dict) and not (isinstance(values, Block) and name in DESCRIBED_ELSEWHERE):
             yield from _nulls(value, f"{prefix}{name}.")

@@ -7,26 +7,32 @@ a finished one is not done again.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
 
 from splatwizard_core.errors import SplatwizardError, UserInputError
 from splatwizard_core.evaluation.metrics import MetricSetup, chosen_metrics, metric_identities
 from splatwizard_core.plugins.versions import changes, installed, providers
 from splatwizard_core.runs import record as schema
 from splatwizard_core.runs.config import ResolvedConfig, content_hash
-from splatwizard_core.runs.contention import CONTENDED, contended_phases
 from splatwizard_core.runs.decode import REPEATS
 from splatwizard_core.runs.directory import CONFIG, ENCODED, RENDERS, RunRequest, StepLog, held_directory, write_config
 from splatwizard_core.runs.encode import encode
+from splatwizard_core.runs.facts import (
+    CONTENDED,
+    DecodingFacts,
+    EncodingFacts,
+    Extent,
+    Measurement,
+    Recorded,
+    TrainingFacts,
+)
 from splatwizard_core.runs.fresh import decode_fresh, run_fresh
 from splatwizard_core.runs.identity import training_key
 from splatwizard_core.runs.phases import phases_of_run
 from splatwizard_core.runs.pretrained import make_method
 from splatwizard_core.runs.session import Session, TrainedModel
-from splatwizard_core.runs.training import total_seconds, train
+from splatwizard_core.runs.training import train
 from splatwizard_core.runs.training_views import collapse_warning
 from splatwizard_native import file_sha256
 
@@ -43,62 +49,63 @@ def run(session: Session, request: RunRequest) -> tuple[schema.Record, Path]:
         steps, encoded = StepLog(directory), directory / ENCODED
         train_key, repeats = training_key(session, resolved), max(REPEATS, request.repeats)
 
-        def encode_it() -> dict[str, Any]:
+        def encode_it() -> EncodingFacts:
             trained = train_in(session, request, directory)
             method = make_method(session.plugins, resolved)
-            raster, origin = trained.facts["raster"], session.scene(resolved).origin
+            raster, origin = trained.facts.raster, session.scene(resolved).origin
             facts = encode(method, trained.model, raster, encoded, origin, deterministic=resolved.ppl.deterministic)
-            session.say(f"encoded {facts['bytes']:,} bytes in {facts['encode_s']:.2f} s")
+            session.say(f"encoded {facts.bytes:,} bytes in {facts.encode_s:.2f} s")
             return facts
 
-        def decode_it() -> dict[str, Any]:
+        def decode_it() -> DecodingFacts:
             facts = decode_fresh(encoded, str(session.device), repeats=repeats, threads=resolved.ppl.threads)
-            counted = ", ".join(f"{n:,} {name.removeprefix('num_')}" for name, n in facts["counts"].items())
-            session.say(f"decoded in a fresh process: {facts['decode_s']:.2f} s, {counted}")
+            counted = ", ".join(f"{n:,} {name.removeprefix('num_')}" for name, n in facts.counts.items())
+            session.say(f"decoded in a fresh process: {facts.decode_s:.2f} s, {counted}")
             return facts
 
-        def evaluate_it() -> dict[str, Any]:
+        def evaluate_it() -> Measurement:
             arguments = ["eval", str(encoded), "--config", str(directory / CONFIG), "--device", str(session.device)]
             arguments += ["--renders", str(directory / RENDERS), "--repeats", str(request.repeats), "--quiet", "--json"]
             arguments += ["--geometry"] * request.geometry
-            return {**run_fresh(arguments, told=session.told), "asked": asked}
+            facts = Measurement.model_validate(run_fresh(arguments, told=session.told))
+            return facts.model_copy(update={"asked": asked})
 
         encoding = steps.once(
-            "encode", content_hash([train_key, resolved.config_content()]), encode_it,
+            "encode", content_hash([train_key, resolved.config_content()]), encode_it, EncodingFacts,
             holds=lambda facts: _is_current(session, encoded, facts),
         )  # fmt: skip
         keys = step_keys(session, resolved, encoding)
         # The extent of the measurement, with the packages and weights that are there now.
         setup = MetricSetup(session.device, resolved.metrics)
         wanted = chosen_metrics(session.plugins.metrics, None, geometry=request.geometry)
-        asked = {
-            "repeats": request.repeats,
-            "metrics": metric_identities(wanted, setup),
-            "eval_train": resolved.ppl.eval_train,
-        }
-        finished = steps.done("record", keys["record"])
-        if finished is not None and measures(finished.get("asked"), asked):
+        asked = Extent(
+            repeats=request.repeats, metrics=metric_identities(wanted, setup), eval_train=resolved.ppl.eval_train
+        )
+        finished = steps.done("record", keys["record"], Recorded)
+        if finished is not None and finished.asked.holds(asked):
             with contextlib.suppress(UserInputError):  # a damaged record is written again
                 record = schema.read_record(directory / schema.FILE_NAME)
-                if record.file.sha256 == encoding["sha256"]:
+                if record.file.sha256 == encoding.sha256:
                     session.say(f"{directory} is finished; nothing to do (--fresh does it again)")
                     return _warned(session, record), directory
-        training = steps.done("train", train_key) or train_in(session, request, directory).facts
+        training = steps.done("train", train_key, TrainingFacts) or train_in(session, request, directory).facts
         write_config(directory, resolved)
         decoded = steps.once(
-            "decode", keys["decode"], decode_it, holds=lambda facts: len(facts["decode_runs_s"]) >= repeats
+            "decode", keys["decode"], decode_it, DecodingFacts, holds=lambda facts: len(facts.decode_runs_s) >= repeats
         )
         measured = steps.once(
-            "evaluate", keys["evaluate"], evaluate_it, holds=lambda facts: measures(facts.get("asked"), asked)
-        )
-        if decoded["digest"] != measured["digest"]:
+            "evaluate", keys["evaluate"], evaluate_it, Measurement,
+            holds=lambda facts: facts.asked is not None and facts.asked.holds(asked),
+        )  # fmt: skip
+        if decoded.digest != measured.digest:
             raise SplatwizardError(
                 f"{encoded}: the decoding and the evaluating process got different models from the same file; "
                 f"method '{resolved.method}' does not decode deterministically"
             )
         record = _record(session, resolved, training, encoding, decoded, measured)
         record.write(directory / schema.FILE_NAME)
-        steps.finish("record", keys["record"], {"sha256": encoding["sha256"], "asked": measured["asked"]})
+        done = Recorded(sha256=encoding.sha256, asked=measured.asked or asked)
+        steps.finish("record", keys["record"], done)
     return _warned(session, record), directory
 
 
@@ -123,21 +130,21 @@ def train_in(session: Session, request: RunRequest, directory: Path, *, stop_aft
     return found
 
 
-def _is_current(session: Session, encoded: Path, facts: dict[str, Any]) -> bool:
+def _is_current(session: Session, encoded: Path, facts: EncodingFacts) -> bool:
     """Whether an encoded file is as it was written, and would be written the same today."""
-    if not encoded.is_file() or file_sha256(encoded) != facts["sha256"]:
+    if not encoded.is_file() or file_sha256(encoded) != facts.sha256:
         return False
-    changed = changes(session.plugins, facts["made_by"])
+    changed = changes(session.plugins, facts.made_by)
     if changed:
         session.say(f"{encoded} was made with {', '.join(changed)}: encoding again")
     return not changed
 
 
-def step_keys(session: Session, resolved: ResolvedConfig, encoding: dict[str, Any]) -> dict[str, str]:
+def step_keys(session: Session, resolved: ResolvedConfig, encoding: EncodingFacts) -> dict[str, str]:
     """Map each step after encoding to the key of what it is made from; the record's holds those before it."""
-    sha256, device = encoding["sha256"], str(session.device)
-    used = installed(session.plugins, [*encoding["made_by"], *providers(session.plugins, "metric", "rasterizer")])
-    decode = content_hash([sha256, device, MEASURING, encoding["made_by"]])
+    sha256, device = encoding.sha256, str(session.device)
+    used = installed(session.plugins, [*encoding.made_by, *providers(session.plugins, "metric", "rasterizer")])
+    decode = content_hash([sha256, device, MEASURING, encoding.made_by])
     evaluate = content_hash(
         [
             sha256, session.scene_digest(resolved), device,
@@ -149,49 +156,34 @@ def step_keys(session: Session, resolved: ResolvedConfig, encoding: dict[str, An
     return {"decode": decode, "evaluate": evaluate, "record": record}
 
 
-def measures(extent: Any, asked: Mapping[str, Any]) -> bool:
-    """Whether a measurement of this extent, as a step remembers it (or anything), holds all that is asked for.
-
-    One that holds more is kept: a run that was measured with LPIPS, or five times over, does not lose that because a
-    later command does not ask for it. An extent is `repeats` of the speed, `metrics`: name -> identity of what its
-    values depend on (None: it cannot be computed now), and `eval_train`: whether training views are among it.
-    """
-    try:
-        known = extent["metrics"]
-        wanted = {name: now for name, now in asked["metrics"].items() if now is not None}
-        enough = extent["repeats"] >= asked["repeats"] and extent.get("eval_train", False) >= asked["eval_train"]
-        return bool(enough) and all(known.get(name) == wanted[name] for name in wanted)
-    except (AttributeError, KeyError, TypeError):
-        return False  # damaged
-
-
 def _record(
     session: Session,
     resolved: ResolvedConfig,
-    training: dict[str, Any],
-    encoding: dict[str, Any],
-    decoded: dict[str, Any],
-    measured: dict[str, Any],
+    training: TrainingFacts,
+    encoding: EncodingFacts,
+    decoded: DecodingFacts,
+    measured: Measurement,
 ) -> schema.Record:
     """Return the record from the facts of the steps: each block takes its fields from whatever step reported them."""
     entry = session.plugins.methods.entry(resolved.method)
-    steps = {**training, **measured, **encoding, **decoded}
-    contended = contended_phases(training, encoding, decoded, measured)
-    values = {
-        **steps,
-        "distribution": f"{entry.distribution} {entry.version}",
-        "preset": resolved.preset,
-        "rate": resolved.rate,
-        "config": resolved.as_dict(),
-        "config_hash": resolved.config_hash(),
-        "file": schema.picked(schema.RecordFile, steps),
-        "codec": schema.picked(schema.CodecBlock, {"peak_decode_bytes": decoded["peak_bytes"]}, steps),
-        "train": schema.picked(schema.TrainBlock, training, {"with_pretraining_s": total_seconds(training)}),
-        "rasterizers": {"train": training["rasterizers"], "render": measured["rasterizers"]},
-        "raster_options": {"train": training["raster"], "render": measured.get("raster", {})},
-        "contended": contended,
-        "flags": [*(flag for flag in measured["flags"] if flag != CONTENDED), *([CONTENDED] if contended else [])],
-        "phases": phases_of_run(session.plugins, training, encoding, measured),
-        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-    }
-    return schema.complete_record(schema.picked(schema.Record, values))
+    contended = training.contended | encoding.contended | decoded.contended | measured.contended
+    steps = {**training.model_dump(), **measured.model_dump(), **encoding.model_dump(), **decoded.model_dump()}
+    return schema.complete_record(
+        {
+            **steps,
+            "distribution": f"{entry.distribution} {entry.version}",
+            "preset": resolved.preset,
+            "rate": resolved.rate,
+            "config": resolved.as_dict(),
+            "config_hash": resolved.config_hash(),
+            "file": steps,
+            "codec": {**steps, "peak_decode_bytes": decoded.peak_bytes},
+            "train": {**training.model_dump(), "with_pretraining_s": training.total_s},
+            "rasterizers": {"train": training.rasterizers, "render": measured.rasterizers},
+            "raster_options": {"train": training.raster, "render": measured.raster},
+            "contended": contended,
+            "flags": [*(flag for flag in measured.flags if flag != CONTENDED), *([CONTENDED] if contended else [])],
+            "phases": [phase.model_dump() for phase in phases_of_run(session.plugins, training, encoding, measured)],
+            "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        }
+    )

@@ -15,6 +15,7 @@ from splatwizard_core.plugins import PluginManager
 from splatwizard_core.plugins.catalogue import package_of
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.runs.config import ResolvedConfig
+from splatwizard_core.runs.facts import TrainingFacts
 from splatwizard_core.scene.digest import scene_digest
 from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.scene.scene import Scene
@@ -31,7 +32,7 @@ class TrainedModel:
 
     model: SplatModel
     key: str
-    facts: dict[str, Any]
+    facts: TrainingFacts
 
 
 @dataclass
@@ -58,7 +59,8 @@ class Session:
         return found
 
     def scene(self, resolved: ResolvedConfig) -> Scene:
-        """Return the scene of a run, loaded once; its warnings are told once."""
+        """Return the scene of a run, loaded once; its warnings are told once, those about values that stand in the
+        config.toml of a run when it was made."""
 
         def load() -> Scene:
             if not resolved.scene_spec:
@@ -68,7 +70,8 @@ class Session:
             for warning in scene.warnings:
                 line = f"scene {scene.name}: {warning}"
                 self.told.append(line)
-                self.say(line)
+                if not resolved.is_of_run(warning.partition(" ")[0]):
+                    self.say(line)
             return scene
 
         return self.once(("scene", resolved.scene_spec, resolved.scene), load)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
+from splatwizard_core.base.lock import directory_lock, is_held
 from splatwizard_core.errors import SplatwizardError
 from splatwizard_core.evaluation.evaluate import evaluate, kept_header, raster_header
 from splatwizard_core.evaluation.metrics import quick_metrics
@@ -17,17 +17,17 @@ from splatwizard_core.plugins import Entry
 from splatwizard_core.plugins.versions import changes, made_by
 from splatwizard_core.runs import pretrained
 from splatwizard_core.runs.config import ResolvedConfig
-from splatwizard_core.runs.contention import contention
 from splatwizard_core.runs.directory import CHECKPOINTS, LOG, RunRequest, StepLog, run_directory
+from splatwizard_core.runs.facts import TrainingFacts, contention
 from splatwizard_core.runs.identity import stored_beside, stored_key, training_identity, training_key
-from splatwizard_core.runs.lock import directory_lock, is_held
 from splatwizard_core.runs.observers import StartedTraining, watched_by
 from splatwizard_core.runs.phases import StageParts
-from splatwizard_core.runs.record import PretrainingBlock, TrainBlock, picked
+from splatwizard_core.runs.record import PretrainingBlock, StageBlock
 from splatwizard_core.runs.session import Session, TrainedModel
 from splatwizard_core.scene.images import decode_all
 from splatwizard_core.streams import stream
 from splatwizard_core.training.checkpoint import CheckpointStore
+from splatwizard_core.training.figures import Block, LoopFigures
 from splatwizard_core.training.pipeline import TrainingRun
 from splatwizard_native import CoreTime, sweep, write_atomic
 
@@ -56,12 +56,12 @@ def train(session: Session, request: RunRequest, directory: Path, *, stop_after:
         if home != directory and home.parent.name == CACHE and not (directory / LOG).exists():
             write_atomic(directory / LOG, (home / LOG).read_text("utf-8"))  # reports look for it here
     steps = StepLog(directory)
-    if steps.done(STEP, key) is None and _finished(session, directory, key) is None:
+    if steps.done(STEP, key, TrainingFacts) is None and _finished(session, directory, key) is None:
         # It uses the training of another directory, which is noted in this one.
-        other = found.facts.get("trained_in")
+        other = found.facts.trained_in
         made = "that others started from" if other == resolved.rate else f"of {other}"
         session.say(f"rate point {resolved.rate} shares the training {made}")
-        steps.finish(STEP, key, {**found.facts, "checkpoints": "elsewhere"})
+        steps.finish(STEP, key, found.facts.model_copy(update={"checkpoints": "elsewhere"}))
     return found
 
 
@@ -71,19 +71,18 @@ def _trained_in(home: Path, session: Session, request: RunRequest, key: str, sto
     steps, done = StepLog(home), _finished(session, home, key)
     if done is None:
         scene = session.scene(resolved)
-        session.say(f"training {resolved.method} on {scene.name} ({resolved.preset} preset, {session.device})")
+        own = pretrained.own_start(resolved)
+        start = f", from {own} in place of the scene's points" if own else ""
+        session.say(f"training {resolved.method} on {scene.name} ({resolved.preset} preset, {session.device}){start}")
         if not CheckpointStore(home / CHECKPOINTS).paths():  # those of another training are refused, and stay as is
-            steps.finish(BEGUN, key, {})  # whoever wants the same scene meanwhile may wait for it
+            steps.finish(BEGUN, key, Block())  # whoever wants the same scene meanwhile may wait for it
     request = replace(request, resume=request.resume or done is not None)
     with plugins.recording() as loaded:
         model, facts = _train_stages(session, request, home, loaded, stop_after, watched=done is None)
     if done is None:
-        rasterizers = plugins.rasterizers
-        served = [rasterizers.entry(name) for name in facts["rasterizers"].values() if name in rasterizers]
-        facts |= {"made_by": made_by(plugins, [*loaded, *served]), "trained_in": resolved.rate}
         steps.finish(STEP, key, facts)
         return TrainedModel(model, key, facts)
-    changed = changes(plugins, done["made_by"])
+    changed = changes(plugins, done.made_by)
     if changed:
         session.say(f"{home} was trained with {', '.join(changed)}; it is used as it is (--fresh trains again)")
     return TrainedModel(model, key, done)  # with what was measured when it was trained, not when it was loaded
@@ -105,7 +104,7 @@ def trained_scene(session: Session, name: str, outer: ResolvedConfig, out: Path)
         return kept
     request, cached = RunRequest(resolved, out), cached_directory(session, resolved, out)
     homes = [*_folders(run_directory(request).parent), cached]
-    begun = (each for each in homes if StepLog(each).done(BEGUN, key) is not None and is_held(each))
+    begun = (each for each in homes if StepLog(each).done(BEGUN, key, Block) is not None and is_held(each))
     directory = _first_finished(session, homes, key) or next(begun, cached)
     with directory_lock(directory, wait=True, say=session.say):
         sweep(directory)
@@ -126,7 +125,7 @@ def _scene_of_file(session: Session, path: Path, outer: ResolvedConfig) -> Train
     digest = session.file_digest(path)
     found = placed_in(pretrained.check_model(str(path)), session.scene(outer), path.name)
     model = found.to(session.device).eval().requires_grad_(False)
-    return TrainedModel(model, digest, {"train_s": None, "file": {"name": path.name, "sha256": digest}})
+    return TrainedModel(model, digest, TrainingFacts(file={"name": path.name, "sha256": digest}))
 
 
 def cached_directory(session: Session, resolved: ResolvedConfig, out: Path) -> Path:
@@ -157,7 +156,7 @@ def _first_finished(session: Session, homes: Iterable[Path], key: str) -> Path |
     return next((each for each in homes if _finished(session, each, key) is not None), None)
 
 
-def _finished(session: Session, directory: Path, key: str) -> dict[str, Any] | None:
+def _finished(session: Session, directory: Path, key: str) -> TrainingFacts | None:
     """Return the facts of this training if a run directory holds it, finished, with its own checkpoints.
 
     Of another release it has another key there, and is known by what its checkpoint says.
@@ -165,8 +164,8 @@ def _finished(session: Session, directory: Path, key: str) -> dict[str, Any] | N
     under = StepLog(directory).key_of(STEP)
     if under is None or not CheckpointStore(directory / CHECKPOINTS).paths():
         return None
-    facts = StepLog(directory).done(STEP, under)
-    if facts is None or "checkpoints" in facts:
+    facts = StepLog(directory).done(STEP, under, TrainingFacts)
+    if facts is None or facts.checkpoints:
         return None
 
     def today() -> str | None:
@@ -188,7 +187,7 @@ def _train_stages(
     stop_after: int | None,
     *,
     watched: bool,
-) -> tuple[SplatModel, dict[str, Any]]:
+) -> tuple[SplatModel, TrainingFacts]:
     """Train the stages of a method in a directory, or load what its checkpoints say is finished.
 
     loaded      entries that the registries are asked for meanwhile, as it grows
@@ -203,7 +202,7 @@ def _train_stages(
     rasterizer = session.rasterizer(resolved, [name for stage in stages for name in stage.prefer])
     options = rasterizer.decided(stages[-1].raster_options(stages[-1].iterations, scene.background))
     parts = StageParts(plugins, stages, ppl, loaded, rasterizer)
-    before: dict[str, dict[str, Any]] = {}
+    before: dict[str, PretrainingBlock] = {}
 
     def frozen(name: str) -> SplatModel:
         """Return the trained scene that a stage starts from or is taught by."""
@@ -214,7 +213,8 @@ def _train_stages(
             )
         with parts.elsewhere():
             source = trained_scene(session, name, resolved, request.out)
-        before[name] = _pretraining_facts(source, pretrained.base_config(plugins, name, resolved))
+        base = pretrained.base_config(plugins, name, resolved)
+        before[name] = source.facts.as_start(base.preset, base.config.model_dump(mode="json"))
         return source.model
 
     def test_metrics(model: SplatModel, step: int) -> dict[str, float]:
@@ -240,33 +240,21 @@ def _train_stages(
             directory=directory / CHECKPOINTS, identity=identity, trained=frozen, stop_after=stop_after,
             resume=request.resume, allow_changed_plan=request.allow_changed_plan, on_step=after_step,
             read_identity=lambda stored: stored_beside(plugins, stored, identity),
-            evaluate=test_metrics, log_path=directory / LOG, provided=parts.since_asked,
+            evaluate=test_metrics, log_path=directory / LOG, provided=parts.since_asked, say=session.say,
         ).train()  # fmt: skip
-    return outcome.model, {
-        **{name: getattr(outcome, name) for name in TrainBlock.model_fields if hasattr(outcome, name)},
-        "stages": [{"name": name, "seconds": seconds} for name, seconds in outcome.stage_seconds.items()],
-        "pretraining": before,
-        "peak_bytes": outcome.peak_memory,
-        "memory_kind": "cuda" if session.device.type == "cuda" else "rss",
-        "breakdown_s": outcome.breakdown or None,
-        "plan": outcome.plan,
-        "rasterizers": outcome.rasterizers,
-        "phases": parts.phases(outcome.provided),
-        "raster": raster_header(options) if outcome.steps else kept_header(outcome.model, options, ppl.raster.options),
-        "contended": contention("train", cores),
-    }
-
-
-def _pretraining_facts(source: TrainedModel, base: ResolvedConfig) -> dict[str, Any]:
-    """Return what is reported of a scene that a training started from; what nobody knows of a file is None."""
-    facts = source.facts
-    if "file" in facts:
-        return picked(PretrainingBlock, {"made_by": {}}, facts)
-    told = {"file": {}, "preset": base.preset, "config": base.config.model_dump(mode="json")}
-    return picked(PretrainingBlock, facts, told, {"train_s": total_seconds(facts)})
-
-
-def total_seconds(facts: Mapping[str, Any]) -> float | None:
-    """Return the seconds of a training with those of what it started from; None if that came from a file."""
-    seconds = [facts["train_s"], *(each["train_s"] for each in facts["pretraining"].values())]
-    return None if None in seconds else sum(seconds)
+    figures, rasterizers = outcome.figures, plugins.rasterizers
+    served = [rasterizers.entry(name) for name in figures.rasterizers.values() if name in rasterizers]
+    return outcome.model, TrainingFacts(
+        **dict(LoopFigures.model_validate(figures.model_dump())),
+        train_s=figures.train_s,
+        steps=figures.steps,
+        stages=[StageBlock(name=name, seconds=seconds) for name, seconds in figures.stage_seconds.items()],
+        pretraining=before,
+        trained_in=resolved.rate,
+        plan=outcome.plan,
+        rasterizers=figures.rasterizers,
+        phases=parts.phases(figures.provided),
+        raster=raster_header(options) if figures.steps else kept_header(outcome.model, options, ppl.raster.options),
+        made_by=made_by(plugins, [*loaded, *served]),
+        contended=contention("train", cores),
+    )

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -27,13 +26,10 @@ LARGEST_GAP = 3.0  # dB between the means of training and of test views
 MAX_NAMED = 3  # views that a warning names
 SHARE = 0.05  # of the training views that lie at or below `quantile_05`
 
-Summary = dict[str, Any]
-"""The values of a `TrainingPsnrBlock`."""
-
 
 def training_psnr(
     scene: Scene, draw: Callable[[Camera], Tensor], device: torch.device
-) -> tuple[Summary | None, dict[str, str]]:
+) -> tuple[TrainingPsnrBlock | None, dict[str, str]]:
     """Draw every training view once and compare, as `psnr` of the test views is computed.
 
     draw    camera on `device` -> [3,H,W], not clamped
@@ -51,7 +47,7 @@ def training_psnr(
     return summary(found)
 
 
-def summary(values: dict[str, float]) -> tuple[Summary | None, dict[str, str]]:
+def summary(values: dict[str, float]) -> tuple[TrainingPsnrBlock | None, dict[str, str]]:
     """Summarise PSNRs by view name, dB, at least one; returns as `training_psnr` does."""
     if any(map(math.isnan, values.values())):
         return None, {"training_psnr": NOT_A_NUMBER}
@@ -65,7 +61,7 @@ def summary(values: dict[str, float]) -> tuple[Summary | None, dict[str, str]]:
     finite = {name: value if math.isfinite(value) else None for name, value in told.items()}
     reasons = {f"training_psnr.{name}": INFINITE for name, value in finite.items() if value is None}
     far = [name for name in ordered if math.isfinite(median) and values[name] < median - FAR_BELOW]
-    return {**finite, "far_below": {name: values[name] for name in far}}, reasons
+    return TrainingPsnrBlock(**finite, far_below={name: values[name] for name in far}), reasons
 
 
 def collapse_warning(record: Record) -> str | None:
@@ -73,7 +69,7 @@ def collapse_warning(record: Record) -> str | None:
     training, test = record.training_psnr, record.metrics.get("psnr")
     if training is None:
         return None
-    told = [_far_below(training, record.train_views)] if training.far_below else []
+    told = [_far_below(training, record.train_views or 0)] if training.far_below else []
     means = training.mean, None if test is None else test.mean
     if means[0] is not None and means[1] is not None and means[0] - means[1] > LARGEST_GAP:
         told.append(

@@ -17,16 +17,17 @@ import re
 import secrets
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
+from pydantic import Field, ValidationError
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
 from splatwizard_core.errors import CheckpointError
+from splatwizard_core.training.figures import Block, TrainingFigures
 from splatwizard_core.training.keys import dotted
 from splatwizard_native import TEMPORARY, replacing
 
@@ -38,10 +39,6 @@ TENSOR_KEY = "$tensor"
 SHOWN_CHARACTERS = 40  # of a value that differs
 _JSON = re.compile(r"\d{2}-\d{7,}\.json")
 _TENSORS = re.compile(r"\d{2}-\d{7,}(-[0-9a-f]{8})?\.safetensors")
-_KINDS: dict[str, Any] = {
-    "stage": int, "stage_name": str, "step": int, "finished": bool, "identity": dict, "plan": list,
-    "extent": (int, float), "progress": dict,
-}  # fmt: skip
 _OURS = re.compile(rf"\.?({_JSON.pattern}|{_TENSORS.pattern})({TEMPORARY}|\.damaged)?")
 
 
@@ -49,8 +46,7 @@ class DamagedCheckpointError(CheckpointError):
     """The pair of files is not what was written; an older one may be."""
 
 
-@dataclass
-class Checkpoint:
+class Checkpoint(Block, strict=True, frozen=False):
     """State of a run after a step.
 
     stage, stage_name, step     where it stands; steps count from 1 in each stage
@@ -58,19 +54,19 @@ class Checkpoint:
     identity    what the result depends on besides the plan: method, version, resolved configuration (JSON-able)
     plan        `plan_lines` of the stage's tasks
     extent      scene extent E, world units
-    progress    what the record of the run accumulates: seconds, steps of earlier stages, peak memory
+    progress    figures of the training up to here
     state       nested dicts and lists of tensors and JSON-able values
     """
 
-    stage: int
+    stage: int = Field(ge=0)
     stage_name: str
-    step: int
+    step: int = Field(ge=0)
     finished: bool
     identity: dict[str, Any]
     plan: list[str]
     extent: float
-    progress: dict[str, Any]
-    state: dict[str, Any]
+    progress: TrainingFigures
+    state: dict[str, Any] = Field(exclude=True)
 
 
 class CheckpointStore:
@@ -93,7 +89,7 @@ class CheckpointStore:
         if path.exists():
             tensor_path = path.with_name(f"{path.stem}-{pair[:8]}.safetensors")
         content = {
-            **{f.name: getattr(checkpoint, f.name) for f in fields(Checkpoint) if f.name != "state"},
+            **checkpoint.model_dump(mode="json"),
             "format": FORMAT,
             "pair": pair,
             "file": tensor_path.name,
@@ -219,11 +215,10 @@ def read_checkpoint(path: Path) -> Checkpoint:
         for name, tensor in tensors.items():
             if _crc(tensor) != content["tensors"][name]:
                 raise DamagedCheckpointError(f"checkpoint {tensor_path} is damaged: tensor '{name}' has changed")
-        values = {f.name: content[f.name] for f in fields(Checkpoint) if f.name != "state"}
-        for name, kind in _KINDS.items():
-            if not isinstance(values[name], kind) or (kind is int and values[name] < 0):
-                raise DamagedCheckpointError(f"checkpoint {path} is damaged: '{name}' is {values[name]!r:.40}")
-        return Checkpoint(**values, state=join_tensors(content["state"], tensors))
+        return Checkpoint.model_validate(content | {"state": join_tensors(content["state"], tensors)})
+    except ValidationError as error:
+        where, what = error.errors()[0]["loc"], error.errors()[0]["input"]
+        raise DamagedCheckpointError(f"checkpoint {path} is damaged: '{where[0]}' is {what!r:.40}") from error
     except FileNotFoundError as error:
         raise DamagedCheckpointError(f"checkpoint {error.filename or tensor_path} is missing") from error
     except (OSError, SafetensorError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:

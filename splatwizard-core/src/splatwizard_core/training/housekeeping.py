@@ -5,185 +5,162 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
+from torch import Tensor
 
 from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.training.checkpoint import Checkpoint, normalised
+from splatwizard_core.training.state import TrainingState
 from splatwizard_core.training.timing import LoopClock
-from splatwizard_core.training.trainer import StepRecord, Trainer
 from splatwizard_native import InterruptGuard, preserved_random_states, read_scalars, synchronize, track
 
 if TYPE_CHECKING:
     from splatwizard_core.training.pipeline import TrainingRun
+    from splatwizard_core.training.trainer import Trainer
 
 log = logging.getLogger(__name__)
 
 Evaluate = Callable[[SplatModel, int], Mapping[str, Any] | None]
-OnStep = Callable[[SplatModel, StepRecord], None]
+OnStep = Callable[[SplatModel, TrainingState], None]
+"""Called after each step: (model, the training), which it leaves as they are."""
 
 UNREAD_LINES = 8  # log lines whose losses stay on a GPU until they are read together: each reading waits for it
 
 
-@dataclass
-class Progress:
-    """Figures that a run accumulates over processes; part of every checkpoint.
+class Line(NamedTuple):
+    """A line of the log whose tensors are still to be read; `facts` are plain values."""
 
-    stage_seconds   stage name -> wall clock of its loop without housekeeping
-    stage_steps     stage name -> steps done
-    breakdown       stage name -> seconds per stage of a step, where they are timed
-    peak_memory     bytes
-    rasterizers     features asked for -> who served them
-    pictures_in     where the training pictures were: "host" or "cuda"
-    provided        stage name -> the rasterizers, pruners, ... that served it, as `TrainingRun.provided` tells
-    """
-
-    stage_seconds: dict[str, float] = field(default_factory=dict)
-    stage_steps: dict[str, int] = field(default_factory=dict)
-    breakdown: dict[str, dict[str, float]] = field(default_factory=dict)
-    peak_memory: int = 0
-    rasterizers: dict[str, str] = field(default_factory=dict)
-    pictures_in: str = "host"
-    provided: dict[str, list[dict[str, str]]] = field(default_factory=dict)
-
-    @property
-    def steps(self) -> int:
-        return sum(self.stage_steps.values())
+    step: int
+    total: Tensor
+    parts: dict[str, Tensor]
+    scalars: dict[str, Tensor]
+    facts: dict[str, Any]
 
 
 class Housekeeping:
-    """The work between the steps of one stage. `Trainer.run` runs inside `around`, and calls `after_step`.
+    """The work between the steps of one stage. `Trainer.run` runs inside `around`, and calls `after_step`."""
 
-    name        of the stage in records (unique in the run)
-    """
-
-    def __init__(self, run: TrainingRun, trainer: Trainer, name: str) -> None:
-        self.run, self.trainer, self.name = run, trainer, name
+    def __init__(self, run: TrainingRun, trainer: Trainer) -> None:
+        self.run, self.trainer, self.state = run, trainer, trainer.state
         self.guard = InterruptGuard()
-        self.clock = LoopClock(run.progress.stage_seconds.get(name, 0.0))
-        self._unread: list[tuple[StepRecord, dict[str, Any]]] = []
+        self.clock = LoopClock(self.state.figures.stage_seconds.get(self.state.name, 0.0))
+        self._unread: list[Line] = []
         self._saved_at = -1
 
     @contextmanager
     def around(self) -> Iterator[None]:
         """The loop, timed and on display."""
-        run, trainer = self.run, self.trainer
-        label = f"train {run.identity.get('method', self.name)}"
+        run, state = self.run, self.state
+        label = f"train {run.identity.get('method', state.name)}"
         if len(run.stages) > 1:
-            label += f": {self.name} ({trainer.index + 1} of {len(run.stages)})"
-        bar = track(label, total=trainer.stage.iterations, start=trainer.step, foretells=True)
+            label += f": {state.name} ({state.index + 1} of {len(run.stages)})"
+        bar = track(label, total=state.iterations, start=state.step, foretells=True)
         with bar as self._bar:
             self.clock.start()
             try:
                 yield
-                synchronize(trainer.device)
+                synchronize(state.device)
             finally:
                 self.clock.stop()
                 self._write_lines()
 
-    def after_step(self, record: StepRecord) -> None:
+    def after_step(self, state: TrainingState) -> None:
         """Do everything that is due after this step."""
-        run, ppl, model = self.run, self.run.ppl, self.trainer.model
-        last = record.step == self.trainer.stage.iterations or self.trainer.stopped
-        due = run.evaluate is not None and ppl.eval_every and record.step % ppl.eval_every == 0
+        run, ppl, model = self.run, state.ppl, state.model
+        due = run.evaluate is not None and ppl.eval_every and state.step % ppl.eval_every == 0
         if due:
-            synchronize(self.trainer.device)  # what is still at work there belongs to the training
+            synchronize(state.device)  # what is still at work there belongs to the training
         self.clock.stop()
         try:
-            self._bar.advance(1, loss=record.total, **{model.ROW_LABEL: record.num_rows})
-            self._log_step(record)
+            self._bar.advance(1, loss=state.total, **{model.ROW_LABEL: state.num_rows})
+            self._log_step()
             with self.guard.interruptible():
                 if run.on_step is not None:
                     with preserved_random_states():
-                        run.on_step(model, record)
+                        run.on_step(model, state)
                 if due and run.evaluate is not None:
-                    self._evaluate(run.evaluate, record.step)
-                if not last and record.step % ppl.checkpoint_every == 0:
+                    self._evaluate(run.evaluate)
+                if not state.finished and state.step % ppl.checkpoint_every == 0:
                     self.save()
         except KeyboardInterrupt:
             # Between steps the state is whole, so nothing that is done is lost. After the last one the stage is
             # over: a resumed run must neither train past a STOP nor find that there is nothing to do.
-            self.save(finished=last)
+            self.save()
             raise
         finally:
             self.clock.start()
 
-    def save(self, *, finished: bool = False) -> None:
+    def save(self) -> None:
         """Write a checkpoint of the last step, unless it is there or a task that it cannot hold is still to run."""
-        run, trainer = self.run, self.trainer
-        if self._saved_at == trainer.step and not finished:
-            return
-        if not finished and (trainer.pre.pending_late(trainer.step) or trainer.post.pending_late(trainer.step)):
-            log.warning(
-                "no checkpoint at step %d: a task that was registered while training is still to run", trainer.step
-            )
-            return
-        trainer.check_losses()
+        run, state = self.run, self.state
+        if not state.finished:
+            if self._saved_at == state.step:
+                return
+            if state.pre.pending_late(state.step) or state.post.pending_late(state.step):
+                log.warning(
+                    "no checkpoint at step %d: a task that was registered while training is still to run", state.step
+                )
+                return
+        self.trainer.check_losses()
         self._write_lines()
         self._account()
         if run.store is not None:
             with run.meter.excluded():
-                run.store.write(
-                    Checkpoint(
-                        trainer.index, trainer.stage.name, trainer.step, finished, normalised(run.identity),
-                        trainer.plan_lines(), run.scene.extent, asdict(run.progress), trainer.state_dict(),
-                    )
-                )  # fmt: skip
-        self._saved_at = trainer.step
+                run.store.write(state.checkpoint(run.identity))
+        self._saved_at = state.step
 
     def _account(self) -> None:
         """Bring the accumulated figures up to date."""
-        progress = self.run.progress
-        progress.rasterizers |= getattr(self.run.rasterizer, "choices", {})
-        progress.stage_seconds[self.name] = self.clock.seconds
-        progress.stage_steps[self.name] = self.trainer.step
-        progress.peak_memory = max(progress.peak_memory, self.run.meter.peak_bytes())
-        if self.trainer.stage_clock is not None:
-            progress.breakdown[self.name] = dict(self.trainer.stage_clock.totals)
-        known = progress.provided.setdefault(self.name, [])
+        figures, name, clock = self.state.figures, self.state.name, self.trainer.stage_clock
+        figures.rasterizers |= getattr(self.state.rasterizer, "choices", {})
+        figures.stage_seconds[name], figures.stage_steps[name] = self.clock.seconds, self.state.step
+        figures.peak_bytes = max(figures.peak_bytes or 0, self.run.meter.peak_bytes())
+        figures.memory_kind = self.run.meter.kind
+        if clock is not None:
+            figures.breakdown_s = {**(figures.breakdown_s or {}), name: dict(clock.totals)}
+        known = figures.provided.setdefault(name, [])
         known += [part for part in self.run.provided() if part not in known]
 
-    def _evaluate(self, evaluate: Evaluate, step: int) -> None:
-        model = self.trainer.model
+    def _evaluate(self, evaluate: Evaluate) -> None:
+        state, model = self.state, self.state.model
         modes = {module: module.training for module in model.modules()}
         # Peak memory is that of the loop alone; an evaluation measures memory of its own.
         with self.run.meter.excluded(), preserved_random_states(), torch.no_grad():
             model.eval()
             try:
-                metrics = evaluate(model, step)
+                metrics = evaluate(model, state.step)
             finally:
                 for module, mode in modes.items():
                     module.training = mode
         if metrics:
-            seconds = {**self.run.progress.stage_seconds, self.name: self.clock.seconds}
-            self.run.run_log.write(self.trainer.index, step, metrics=dict(metrics), train_s=sum(seconds.values()))
+            seconds = {**state.figures.stage_seconds, state.name: self.clock.seconds}
+            self.run.run_log.write(state.index, state.step, metrics=dict(metrics), train_s=sum(seconds.values()))
 
-    def _log_step(self, record: StepRecord) -> None:
-        for task, said in record.said:
-            self.run.run_log.write(record.stage, record.step, task=task, **({"said": said} if said else {}))
+    def _log_step(self) -> None:
+        state = self.state
+        for task, said in state.said:
+            self.run.run_log.write(state.index, state.step, task=task, **({"said": said} if said else {}))
             if said:
-                self._bar.say(f"step {record.step:,}, {task}: {said}")
-        if record.step not in (1, record.iterations) and record.step % self.run.ppl.log_every and not record.scalars:
+                self._bar.say(f"step {state.step:,}, {task}: {said}")
+        if state.step not in (1, state.iterations) and state.step % state.ppl.log_every and not state.scalars:
             return
-        groups = self.trainer.optimizer.groups.values()
-        facts = {"lr": {group.name: group.lr for group in groups}, **self.trainer.model.counts()}
-        self._unread.append((record, facts))
-        if self.trainer.device.type == "cpu" or len(self._unread) >= UNREAD_LINES:
+        facts: dict[str, Any] = {"view": state.view}
+        if state.seconds:
+            facts["seconds"] = {name: round(seconds, 6) for name, seconds in state.seconds.items()}
+        facts["lr"] = {group.name: group.lr for group in state.optimizer.groups.values()}
+        self._unread.append(Line(state.step, state.total, state.parts, state.scalars, facts | state.model.counts()))
+        if state.device.type == "cpu" or len(self._unread) >= UNREAD_LINES:
             self._write_lines()
 
     def _write_lines(self) -> None:
         if not self._unread:
             return
-        tensors = [x for r, _ in self._unread for x in (r.total, *r.parts.values(), *r.scalars.values())]
+        tensors = [x for line in self._unread for x in (line.total, *line.parts.values(), *line.scalars.values())]
         values = iter(read_scalars(tensors))
-        for record, facts in self._unread:
-            line: dict[str, Any] = {"view": record.view, "loss": next(values)}
-            line["parts"] = {name: next(values) for name in record.parts}
-            if record.seconds:
-                line["seconds"] = {name: round(seconds, 6) for name, seconds in record.seconds.items()}
-            if record.scalars:
-                line["scalars"] = {name: next(values) for name in record.scalars}
-            self.run.run_log.write(record.stage, record.step, **line, **facts)
+        for line in self._unread:
+            read: dict[str, Any] = {"loss": next(values), "parts": {name: next(values) for name in line.parts}}
+            if line.scalars:
+                read["scalars"] = {name: next(values) for name in line.scalars}
+            self.run.run_log.write(self.state.index, line.step, **read, **line.facts)
         self._unread.clear()

@@ -3,25 +3,15 @@
 from __future__ import annotations
 
 import difflib
-import types
 import typing
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, Union
+from typing import Any
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
+from splatwizard_core.base.values import members
 from splatwizard_core.training.params import PipelineParams, ReadsFile, SceneParams
-
-
-def members(annotation: Any) -> list[Any]:
-    """Return the alternatives of a union (NoneType among them), or the one type, without Annotated[...] around it."""
-    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
-    if origin is Annotated:
-        return members(arguments[0])
-    if origin in (Union, types.UnionType):
-        return [member for argument in arguments for member in members(argument)]
-    return [annotation]
 
 
 def block_of(annotation: Any) -> type[BaseModel] | None:

@@ -7,10 +7,10 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
+from splatwizard_core.base.values import parse_text
 from splatwizard_core.errors import ConfigError
 from splatwizard_core.training.keys import block_keys, field_at, set_at, suggest
 from splatwizard_core.training.params import OptimizationParams
-from splatwizard_core.training.values import parse_text
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
 

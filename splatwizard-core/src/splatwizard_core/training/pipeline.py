@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, replace
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +24,15 @@ from splatwizard_core.training.checkpoint import (
     differences,
     normalised,
 )
-from splatwizard_core.training.housekeeping import Evaluate, Housekeeping, OnStep, Progress
+from splatwizard_core.training.figures import Provided, StagePlan, TrainingFigures
+from splatwizard_core.training.housekeeping import Evaluate, Housekeeping, OnStep
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.plan import plan_rows
 from splatwizard_core.training.rng import Streams
 from splatwizard_core.training.run_log import RunLog
 from splatwizard_core.training.scheduler import build_schedulers
 from splatwizard_core.training.stage import Stage, StageContext
+from splatwizard_core.training.state import TrainingState
 from splatwizard_core.training.timing import StageClock
 from splatwizard_core.training.trainer import Trainer
 from splatwizard_native import MemoryMeter, seeded
@@ -44,21 +46,18 @@ class TrainingStopped(KeyboardInterrupt):
     """`stop_after` was reached and a checkpoint written: the run is to be resumed, its outcome does not exist yet."""
 
 
-@dataclass(kw_only=True)
-class TrainOutcome(Progress):
-    """A finished training: its figures, of resumed processes too, and
+@dataclass(frozen=True)
+class TrainOutcome:
+    """A finished training.
 
     model   as the last stage's `finish` returned it
-    plan    of each stage: name, steps, its tasks as printed, and what was looked up for the scene
+    figures of all stages, of resumed processes too
+    plan    of each stage
     """
 
     model: SplatModel
-    plan: list[dict[str, Any]]
-
-    @property
-    def train_s(self) -> float:
-        """Seconds of all stages' loops, without housekeeping."""
-        return sum(self.stage_seconds.values())
+    figures: TrainingFigures
+    plan: list[StagePlan]
 
 
 @dataclass
@@ -79,6 +78,7 @@ class TrainingRun:
                     in eval mode, with the process-wide random states kept
     log_path        of log.jsonl; default: in `directory`
     provided        () -> what served (rasterizers, pruners, ...) since it was last asked: kept by stage
+    say             is told from which step a resumed training goes on
     """
 
     stages: Sequence[Stage]
@@ -97,7 +97,8 @@ class TrainingRun:
     on_step: OnStep | None = None
     evaluate: Evaluate | None = None
     log_path: Path | None = None
-    provided: Callable[[], list[dict[str, str]]] = list
+    provided: Callable[[], list[Provided]] = list
+    say: Callable[[str], None] = log.info
 
     def __post_init__(self) -> None:
         if not self.stages:
@@ -108,7 +109,7 @@ class TrainingRun:
         if self.log_path is None and self.directory is not None:
             self.log_path = self.directory / "log.jsonl"
         self.run_log = RunLog(self.log_path)
-        self.progress = Progress()
+        self.figures = TrainingFigures()
         self.meter = MemoryMeter("cpu")
         self.names: list[str] = []  # of the stages, made unique
         for stage in self.stages:
@@ -132,23 +133,26 @@ class TrainingRun:
             if trainer is None:
                 self.run_log.clear()
             else:
-                first = trainer.index
-                self.run_log.rewind(first, trainer.step)
+                first, state = trainer.state.index, trainer.state
+                if not state.stopped:
+                    where = f" of stage '{state.name}'" if len(self.stages) > 1 else ""
+                    self.say(f"going on after step {state.step:,} of {state.iterations:,}{where}")
+                self.run_log.rewind(first, state.step)
                 self.provided()  # what began the stage is known from the process that began it
             for index in range(first, len(self.stages)):
                 trainer = trainer or self._trainer(index, model)
                 if self.meter.kind == "rss" and trainer.device.type == "cuda":
                     self.meter = MemoryMeter(trainer.device)
                     self.meter.start()
-                if not trainer.stopped:
+                if not trainer.state.stopped:
                     self._run_stage(trainer)
-                model = trainer.stage.finish(trainer.model, self.scene)
+                model = trainer.state.stage.finish(trainer.state.model, self.scene)
                 trainer = None
         assert model is not None
         model.check_finite()
-        self.progress.provided = {name: self.progress.provided.get(name, []) for name in self.names}
+        self.figures.provided = {name: self.figures.provided.get(name, []) for name in self.names}
         plan = [self._describe(stage, name) for stage, name in zip(self.stages, self.names, strict=True)]
-        return TrainOutcome(**vars(self.progress), model=model, plan=plan)
+        return TrainOutcome(model, self.figures, plan)
 
     def _trainer(self, index: int, model: SplatModel | None) -> Trainer:
         """Return the trainer of a stage before its first step.
@@ -164,10 +168,14 @@ class TrainingRun:
             model = self.create_model()
         self._check_order_of_sums(model.device)
         model = stage.begin(StageContext(model, self.scene, self.ppl, self.rasterizer, streams, self.trained))
-        clock = None
+        name, clock = self.names[index], None
         if self.ppl.profile == "stages":
-            clock = StageClock(model.device, self.progress.breakdown.get(self.names[index]))
-        return Trainer(stage, model, self.scene, self.ppl, self.rasterizer, streams, index=index, stage_clock=clock)
+            clock = StageClock(model.device, (self.figures.breakdown_s or {}).get(name))
+        state = TrainingState.begin(
+            stage, model, self.scene, self.ppl, self.rasterizer, streams,
+            index=index, name=name, figures=self.figures,
+        )  # fmt: skip
+        return Trainer(state, clock)
 
     def _check_order_of_sums(self, device: torch.device) -> None:
         """Raise ConfigError where equal bits are asked for, and no rasterizer of this run gives them."""
@@ -187,17 +195,14 @@ class TrainingRun:
             return None
         assert self.store is not None
         try:
-            trainer = self._restore(self.store.last_of(index - 1))
+            state = self._restore(self.store.last_of(index - 1)).state
         except DamagedCheckpointError as error:  # no fault of the checkpoint that goes on from it
             raise CheckpointError(f"{error}; start again (--fresh)") from error
-        return trainer.stage.finish(trainer.model, self.scene)
+        return state.stage.finish(state.model, self.scene)
 
     def _resumed(self, saved: Checkpoint) -> Trainer:
         """`_restore`, and what the record has accumulated, which the trainer's clock goes on from."""
-        try:
-            self.progress = Progress(**saved.progress)
-        except TypeError as error:
-            raise DamagedCheckpointError(f"the checkpoint of step {saved.step} is damaged: {error}") from error
+        self.figures = saved.progress
         return self._restore(saved)
 
     def _restore(self, saved: Checkpoint) -> Trainer:
@@ -206,8 +211,8 @@ class TrainingRun:
             raise CheckpointError(f"the checkpoint is of stage {saved.stage}, this run has {len(self.stages)} stages")
         trainer = self._trainer(saved.stage, self._before(saved.stage))
         where = f"the checkpoint of stage '{saved.stage_name}', step {saved.step},"
-        told = replace(saved, identity=normalised(self.read_identity(saved.identity)))
-        changed = differences(told, self.identity, trainer.plan_lines(), self.scene.extent)
+        told = saved.model_copy(update={"identity": normalised(self.read_identity(saved.identity))})
+        changed = differences(told, self.identity, trainer.state.plan_lines(), self.scene.extent)
         if changed and not self.allow_changed_plan:
             more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
             raise CheckpointError(
@@ -217,7 +222,7 @@ class TrainingRun:
         for line in changed:
             log.warning("resuming with a changed plan or configuration: %s", line)
         try:
-            trainer.load_state_dict(saved.state, saved.step)
+            trainer.state.load_state_dict(saved.state, saved.step)
         except torch.OutOfMemoryError:
             raise
         except Exception as error:  # whatever a part of the state raises that is not what it wrote
@@ -225,27 +230,26 @@ class TrainingRun:
             kind = CheckpointError if changed else DamagedCheckpointError
             raise kind(f"{where} does not fit this run: {type(error).__name__}: {error}") from error
         # A stage that was finished under another plan may have steps left under this one.
-        trainer.stopped = saved.finished and not changed
+        trainer.state.stopped = saved.finished and not changed
         return trainer
 
-    def _describe(self, stage: Stage, name: str) -> dict[str, Any]:
+    def _describe(self, stage: Stage, name: str) -> StagePlan:
         """Return a stage's plan for the record."""
         pre, post = build_schedulers(stage, self.ppl)
-        rows = plan_rows(pre.registrations, post.registrations, total=stage.iterations)
-        found = {"looked_up": values} if (values := stage.looked_up(self.scene)) else {}
-        return {"stage": name, "iterations": stage.iterations, "tasks": rows, **found}
+        tasks = plan_rows(pre.registrations, post.registrations, total=stage.iterations)
+        looked_up = stage.looked_up(self.scene)
+        return StagePlan(stage=name, iterations=stage.iterations, tasks=tasks, looked_up=looked_up)
 
     def _run_stage(self, trainer: Trainer) -> None:
         """Train a stage to its end, with its last checkpoint. Raises TrainingStopped where the run is to stop."""
-        index, iterations, name = trainer.index, trainer.stage.iterations, self.names[trainer.index]
-        before = self.progress.steps - self.progress.stage_steps.get(name, 0)
-        stop_after = self.stop_after
-        until = iterations if stop_after is None else min(iterations, stop_after - before)
-        housekeeping = Housekeeping(self, trainer, name)
-        trains = iterations and (until > trainer.step or stop_after is None)  # a method that only encodes has no steps
+        state, stop_after = trainer.state, self.stop_after
+        before = self.figures.steps - self.figures.stage_steps.get(state.name, 0)
+        until = state.iterations if stop_after is None else min(state.iterations, stop_after - before)
+        housekeeping = Housekeeping(self, trainer)
+        trains = state.iterations and (until > state.step or stop_after is None)  # one that only encodes has no steps
         if trains:
             decode_all(self.scene.train)  # reading pictures is not training time
-            self.progress.pictures_in = "cuda" if keep_pictures(self.scene.train, trainer.device) else "host"
+            self.figures.pictures_in = "cuda" if keep_pictures(self.scene.train, state.device) else "host"
         # A Ctrl-C waits for the end of its step, and one after the last step until that is saved.
         with housekeeping.guard:
             if trains:
@@ -254,8 +258,7 @@ class TrainingRun:
                         trainer.run(until, housekeeping.after_step)
                 finally:
                     keep_pictures(self.scene.train, "cpu")
-            finished = trainer.stopped or trainer.step >= iterations
-            housekeeping.save(finished=finished)
-        done, last = before + trainer.step, finished and index == len(self.stages) - 1
+            housekeeping.save()
+        done, last = before + state.step, state.finished and state.index == len(self.stages) - 1
         if stop_after is not None and done >= stop_after and not last:
             raise TrainingStopped(f"stopped after step {done}; run again to go on")

@@ -1,0 +1,96 @@
+"""Typed blocks of figures: what a training counts and times, as its checkpoints and the result record hold it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field
+
+MemoryKind = Literal["cuda", "rss"]
+"""What was measured as memory: torch's allocator, or the growth of the resident set."""
+
+
+class Block(BaseModel):
+    """Base of every block: no number that is not finite; keys that only another release has are passed over."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False, populate_by_name=True)
+
+
+@dataclass(frozen=True)
+class WhyNull:
+    """Marks a field with the reason of its null, where whoever measured it told none."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Marks a field that the report of a run shows among times and memory, its description beside it.
+
+    unit    "s", "bytes", or "" for a count
+    """
+
+    label: str
+    unit: Literal["s", "bytes", ""] = ""
+
+
+class Provided(Block):
+    """A part that served: a registered thing by kind and name, a training `stage`, or a `task` of another package."""
+
+    kind: str
+    name: str
+    distribution: str = Field("", description="pip distribution; empty: of none that is installed")
+    version: str = ""
+
+
+class StagePlan(Block):
+    """The executed plan of a training stage."""
+
+    stage: str = ""
+    iterations: int = 0
+    tasks: list[dict[str, Any]] = Field([], description="as `sw schedule --json` prints them")
+    looked_up: dict[str, Any] = Field({}, description="values that the configuration leaves to the scene, by key")
+
+
+class LoopFigures(Block):
+    """Figures of the training loop that the record's block `train` holds as the loop has them."""
+
+    peak_bytes: Annotated[int | None, WhyNull("not measured")] = Field(
+        None,
+        validation_alias=AliasChoices("peak_bytes", "peak_memory"),
+        description="over the loop; without evaluation and checkpoints since schema 2",
+    )
+    memory_kind: MemoryKind | None = Field(None, description="what `peak_bytes` counts: cuda, rss")
+    pictures_in: str | None = Field(None, description="where the training pictures lay: host, cuda")
+    breakdown_s: Annotated[dict[str, dict[str, float]] | None, WhyNull("not profiled (--set profile=stages)")] = Field(
+        None,
+        validation_alias=AliasChoices("breakdown_s", "breakdown"),
+        description="stage -> part of a step -> seconds, if profiled",
+    )
+
+
+class TrainingFigures(LoopFigures, frozen=False):
+    """Figures of a training over all its stages and processes; part of every checkpoint.
+
+    stage_seconds   stage name -> wall clock of its loop without housekeeping
+    stage_steps     stage name -> steps done
+    rasterizers     features asked for -> who served them
+    provided        stage name -> the rasterizers, pruners, ... that served it
+    """
+
+    pictures_in: str = "host"
+    stage_seconds: dict[str, float] = {}
+    stage_steps: dict[str, Annotated[int, Field(ge=0)]] = {}
+    rasterizers: dict[str, str] = {}
+    provided: dict[str, list[Provided]] = {}
+
+    @property
+    def steps(self) -> int:
+        """Steps of all stages."""
+        return sum(self.stage_steps.values())
+
+    @property
+    def train_s(self) -> float:
+        """Seconds of all stages' loops, without housekeeping."""
+        return sum(self.stage_seconds.values())
