@@ -31,7 +31,7 @@ from torch import Tensor, nn
 from splatwizard_core.api import BitstreamError
 from sw_cat_3dgs.context import PLANES, CatContext, ContextShape
 from sw_cat_3dgs.model import CatAnchors
-from sw_cat_3dgs.predictors import PREDICTORS, Predictor
+from sw_cat_3dgs.rate_model import CatRateModel, Predictor
 from sw_cat_3dgs.spatial_ar import SpatialAr
 from sw_cat_3dgs.stage import base_resolution
 from sw_cat_3dgs.triplane import GAIN
@@ -64,7 +64,7 @@ def encode(model: CatAnchors, writer: ContainerWriter, config: CatConfig) -> Non
     _use_integers(context, planes)
 
     attributes = AttributeEncoder(model, rows, sections(context.shape), mode)
-    predictor = PREDICTORS[mode](context)
+    predictor = CatRateModel.of_file(context).predictor(mode)
     if len(rows):
         with one_thread() if mode == "float" else torch.no_grad():
             walk(attributes, predictor, context.places(geometry.codes, geometry.bounds), geometry.masks)
@@ -93,7 +93,7 @@ def decode(reader: ContainerReader) -> DecodedAnchors:
         shapes = [(shape.channels, m * resolution, m * resolution) for m in shape.multiples]
         _use_integers(context, SpatialAr.decode(data, shapes, arms))
     with reader.decoding("networks"):
-        predictor = PREDICTORS[mode](context)
+        predictor = CatRateModel.of_file(context).predictor(mode)
 
     attributes = AttributeDecoder(reader, model, sections(shape), mode)
     if n:
