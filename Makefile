@@ -37,14 +37,14 @@ test-geometry: $(VENV)/.ready-dev
 	$(BIN)/python -m pytest -m 'not cuda' plugins/sw-geometry $(PYTEST_ARGS)
 
 test-ray: $(VENV)/.ready-dev
-	$(PIP) install -q -c constraints.txt -e 'plugins/sw-ray[ray]' -e 'plugins/sw-bench[slurm]' --no-build-isolation
-	$(BIN)/python -m pytest -m 'not cuda' plugins/sw-ray plugins/sw-bench/tests/test_executors.py $(PYTEST_ARGS)
+	$(PIP) install -q -c constraints.txt -e 'plugins/sw-bench[ray,slurm]' --no-build-isolation
+	$(BIN)/python -m pytest -m 'not cuda' plugins/sw-bench/tests/test_ray.py plugins/sw-bench/tests/test_executors.py $(PYTEST_ARGS)
 
 # viser without its pins, which name an older rich than ours; Chromium is the system's.
 test-browser: $(VENV)/.ready-dev
 	$(PIP) install -q --no-deps viser==1.1.1
 	$(PIP) install -q 'websockets<17' msgspec trimesh imageio requests tqdm zstandard
-	$(BIN)/python -m pytest -m slow plugins/sw-viewer/tests/test_viewer_browser.py plugins/sw-report/tests/test_report_browser.py $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -m slow plugins/sw-view/tests/test_viewer_browser.py plugins/sw-report/tests/test_report_browser.py $(PYTEST_ARGS)
 
 # Needs node 18 or newer; what is installed stays below build/.
 test-interchange: $(VENV)/.ready-dev

@@ -8,7 +8,7 @@ A scene is FOLDER[:PICTURES], FAMILY:FOLDER[:PICTURES] or demo.
 Every row is a `sw run`: encoded, decoded in a fresh process, evaluated on the test views. 3DGS r1 to r6 and the formats
 encode the same Gaussians; LightGaussian prunes and distils them; ChimeraGS trains its own, taught by them. --steps
 scales all plans by the same factor. Finished runs are not done again. Bytes are those of the .swz; those of a format's
-own file, a few hundred fewer, stand beside them. Needs sw-formats, sw-3dgs, sw-lightgaussian and sw-chimerags, with
+own file, a few hundred fewer, stand beside them. Needs sw-interchange, sw-3dgs, sw-lightgaussian and sw-chimerags, with
 zstandard and Pillow (WebP), and no network.
 
     python tools/results.py collect OUT/SCENE --name formats-SCENE       # keeps the rows, for docs/formats.md

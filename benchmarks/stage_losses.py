@@ -32,7 +32,7 @@ from sw_compact3dgs import file as compact_file
 from sw_compact3dgs.config import FileSettings
 from sw_compact3dgs.decoded import DecodedGaussians
 from sw_compact3dgs.model import PLAIN, CompactGaussians
-from sw_finetuning.pruning import lowest, removal_count, up_to
+from sw_gaussians.finetune.pruning import lowest, removal_count, up_to
 
 from splatwizard_core.api import ContainerReader, ContainerWriter, GaussianModel, SplatModel, UserInputError
 from splatwizard_core.evaluation.evaluate import evaluate, render_options, suggested_rasterizers

@@ -20,11 +20,11 @@ from pathlib import Path
 
 import torch
 from PIL import Image
-from sw_render.drawing import Drawing
-from sw_viewer.frames import Pace, frame_size
-from sw_viewer.looks import look
-from sw_viewer.packing import solid_means
-from sw_viewer.shown_cameras import Surroundings, surroundings_about, surroundings_of
+from sw_view.drawing import Drawing
+from sw_view.frames import Pace, frame_size
+from sw_view.looks import look
+from sw_view.packing import solid_means
+from sw_view.shown_cameras import Surroundings, surroundings_about, surroundings_of
 
 from splatwizard_core.api import Camera, GaussianModel, Protocol, RasterOptions, Scene, SceneOptions, SplatModel
 from splatwizard_core.tooling import NegotiatedRasterizer, PluginManager, load_plugins, load_scene, open_model

@@ -11,6 +11,8 @@ import pytest
 from fresh_environments import WORKSPACE, FreshEnvironment, build_wheels, is_ours, make_environment
 from import_graph import needed
 
+collect_ignore = ["golden/packages_0_2"]  # its tests run where it is installed (test_package_of_0_2.py)
+
 
 @pytest.fixture(scope="session")
 def wheels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:

@@ -19,8 +19,11 @@ ROOT = Path(__file__).parents[1]
 NATIVE = ROOT / "splatwizard-native" / "src" / "splatwizard_native"
 """The base below the core."""
 CORE = ROOT / "splatwizard-core" / "src" / "splatwizard_core"
-PACKAGES = sorted(p for p in ROOT.glob("plugins/*/src/sw_*") if p.is_dir())
+_PLUGINS = sorted(p for p in ROOT.glob("plugins/*/src/sw_*") if (p / "__init__.py").is_file())
+PACKAGES = [p for p in _PLUGINS if p.name.replace("_", "-") == p.parents[1].name]
 """Import packages of the workspace above the core."""
+FORWARDING = [p for p in _PLUGINS if p not in PACKAGES]
+"""Old import paths that a package brings besides, for one release."""
 STRANGERS = sorted(p for folder in ("examples", "tests/plugins") for p in ROOT.glob(f"{folder}/*/src/sw_*"))
 """Packages as third parties would write them."""
 

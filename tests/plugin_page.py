@@ -12,7 +12,7 @@ PAGE = (Path(__file__).resolve().parents[1] / "docs" / "plugins.md").read_text("
 PACKAGE = "sw_theirs"
 LIBRARIES = ["sw-codecs", "sw-datasets", "sw-gaussians", "sw-reference"]
 OTHERS = ["click>=8.1", "numpy>=1.26", "pillow>=10.3", "pydantic>=2.7", "torch>=2.4"]
-REQUIRES = [*re.findall(r'^dependencies = \["(.*?)"\]', PAGE, re.M), *(f"{name}>=0.2" for name in LIBRARIES), *OTHERS]
+REQUIRES = [*re.findall(r'^dependencies = \["(.*?)"\]', PAGE, re.M), *(f"{name}>=0.3" for name in LIBRARIES), *OTHERS]
 HOOKS = {name for name, hook in vars(hookspecs).items() if hasattr(hook, f"{hookspecs.PROJECT}_spec")}
 
 

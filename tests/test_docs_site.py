@@ -31,7 +31,7 @@ def without_links_out():
         ("methods/hac.md", "see [runs](../runs.md)", None),
         ("guide.md", "[below](#here), [there](https://example.org/x)", None),
         ("guide.md", "![curves](images/report.png)", None),
-        ("guide.md", "the [README](../plugins/sw-render/README.md) of it", "the README of it"),
+        ("guide.md", "the [README](../plugins/sw-view/README.md) of it", "the README of it"),
         ("guide.md", "in [methods](methods)", "in methods"),
         ("guide.md", "[gone](gone.md)", "gone"),
     ],

@@ -54,15 +54,14 @@ ROOMS = {
 """Room of the core -> the rooms that it may import when it runs. What only a type checker reads is free."""
 
 LIBRARIES = {
-    "sw_rasterizers", "sw_codecs", "sw_gaussians", "sw_anchors", "sw_finetuning", "sw_reference", "sw_interchange",
-    "sw_render", "sw_report",
+    "sw_rasterizers", "sw_codecs", "sw_gaussians", "sw_anchors", "sw_reference", "sw_interchange", "sw_view",
+    "sw_report",
 }  # fmt: skip
 """Packages that others may import when they declare them; of sw_report the file format of published figures alone."""
 EXTENDS = {"sw_hac_plus": "sw_hac"}
 """Method -> the method that it builds on, and so imports."""
 ABOUT_RUNS = {
-    "sw_bench", "sw_datasets", "sw_doctor", "sw_geometry", "sw_kit", "sw_metrics", "sw_render", "sw_report",
-    "sw_viewer",
+    "sw_bench", "sw_datasets", "sw_doctor", "sw_geometry", "sw_kit", "sw_metrics", "sw_report", "sw_view",
 }  # fmt: skip
 """Packages that may use `tooling` besides `api`."""
 

@@ -33,14 +33,15 @@ def test_the_metadata_of_a_wheel_is_complete(project: Path, tmp_path: Path, monk
     assert addresses
     assert all(re.fullmatch(r"https://\S+", address) for address in addresses)
     assert (project / "LICENSE").read_text("utf-8") == LICENSE
-    (package,) = (path.parent for path in project.glob("src/*/__init__.py"))
-    assert (package / "py.typed").is_file()
+    packages = [path.parent for path in project.glob("src/*/__init__.py")]
+    assert project.name.replace("-", "_") in [package.name for package in packages]
+    assert all((package / "py.typed").is_file() for package in packages)
 
 
 def test_a_wheel_carries_the_licence_and_the_types(tmp_path: Path):
     (wheel,) = build_wheels([ROOT / "plugins" / "sw-3dgs"], tmp_path)
     names = zipfile.ZipFile(wheel).namelist()
-    assert "sw_3dgs-0.2.0.dist-info/licenses/LICENSE" in names
+    assert f"sw_3dgs-{__version__}.dist-info/licenses/LICENSE" in names
     assert "sw_3dgs/py.typed" in names
 
 

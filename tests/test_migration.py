@@ -44,7 +44,8 @@ def test_the_page_has_the_table_and_every_new_place_is_there():
         ("splatwizard-core>=0.1", "0.1"),
         ("splatwizard_core==0.1.*", "0.1"),
         ("splatwizard-core<0.2,>=0.1.3", "0.1"),
-        ("splatwizard-core>=0.2,<0.3", ""),
+        ("splatwizard-core>=0.2,<0.3", "0.2"),
+        ("splatwizard-core>=0.3,<0.4", ""),
         ("splatwizard-core", ""),
         ("numpy>=0.1", ""),
         ("not a requirement ==", ""),
@@ -61,7 +62,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Site:
         site.install(name, source, requires=requires)
     site.install("sw-old-bound", "", requires=["splatwizard-core>=0.1,<0.2"])
     site.install("sw-old-works", metric("works", "sw_old_works"), requires=ANY)
-    site.install("sw-new-fails", "1 / 0", requires=["splatwizard-core>=0.2,<0.3"])
+    site.install("sw-new-fails", "1 / 0", requires=["splatwizard-core>=0.3,<0.4"])
     site.install("sw-unreadable", "", requires=["this is == no requirement"])
     install(site, "sw-third", (OLD / "plugin.py").read_text(), (OLD / "method.py").read_text(), ANY)
     return site
@@ -110,7 +111,7 @@ def test_the_example_of_0_1_is_told_where_its_imports_are_and_works_with_them_re
     moved = Site(tmp_path)
     texts = [re.sub(r"from splatwizard_core\.[\w.]+ import", "from splatwizard_core.api import", path.read_text())
              for path in (OLD / "plugin.py", OLD / "method.py")]  # fmt: skip
-    install(moved, "sw-third", *texts, ["splatwizard-core>=0.2,<0.3"])
+    install(moved, "sw-third", *texts, ["splatwizard-core>=0.3,<0.4"])
     steps = ("--set", "iterations=2", "--set", "base_iterations=2")
     done = moved.sw("run", "--method", "opacity-prune", "--scene", "demo:tiny", *steps, "--out", "out")
     assert "decoded in a fresh process" in done.stderr

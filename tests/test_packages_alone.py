@@ -111,7 +111,7 @@ def test_a_library_that_is_gone_is_named(everything):
 @pytest.mark.parametrize(
     ("command", "package"),
     [(["report", "out"], "sw-report"), (["doctor"], "sw-doctor"), (["data", "list"], "sw-datasets"),
-     (["render", "x.swz"], "sw-render"), (["bench"], "sw-bench"), (["run", "--scene", "a,b"], "sw-bench"),
+     (["render", "x.swz"], "sw-view"), (["bench"], "sw-bench"), (["run", "--scene", "a,b"], "sw-bench"),
      (["run", "--method", "hac"], "sw-hac"),
      (["info", "mipnerf360/garden"], "sw-datasets")],
 )  # fmt: skip

@@ -98,7 +98,7 @@ def from_wheels(advice_as_installed, monkeypatch: pytest.MonkeyPatch, tmp_path: 
 def test_what_the_code_can_print_is_collected():
     found = collected()
     assert len(found) >= 25
-    assert {"pip install 'sw-geometry[mesh]'", "pip install 'sw-viewer[viser]'", "pip install sw-hac"} <= set(found)
+    assert {"pip install 'sw-geometry[mesh]'", "pip install 'sw-view[viser]'", "pip install sw-hac"} <= set(found)
 
 
 def test_every_command_for_ours_names_folders_and_extras_that_are_there(from_here):
@@ -150,7 +150,7 @@ def test_pip_takes_every_command_of_a_checkout(from_here):
     [
         ("needs Open3D: pip install 'sw-geometry[mesh]'", "needs Open3D: PIP install -e 'plugins/sw-geometry[mesh]'"),
         ("(pip install 'sw-gsplat[gsplat]')", "(PIP install -e 'plugins/sw-gsplat[gsplat]')"),
-        ("comes with sw-ray: pip install sw-ray", "comes with sw-ray: PIP install -e plugins/sw-ray"),
+        ("comes with sw-kit: pip install sw-kit", "comes with sw-kit: PIP install -e plugins/sw-kit"),
         ("pip install sw-3dgs, or not", "PIP install -e plugins/sw-3dgs, or not"),
         ("pip install 'sw-hac>=0.1' (as the file says)", "PIP install -e plugins/sw-hac (as the file says)"),
         ("pip install 'sw-hac>=99.0'", "git -C . pull && PIP install -e plugins/sw-hac"),
@@ -184,8 +184,8 @@ def test_wheels_are_looked_for_where_the_core_came_from(from_wheels):
 def test_an_installation_of_unknown_origin_is_told_what_to_name(advice_as_installed, monkeypatch):
     monkeypatch.setattr(remedies, "_origin", lambda: None)
     monkeypatch.setattr(remedies, "pip", lambda: "pip")
-    assert as_installed("pip install sw-ray") == (
-        "pip install --find-links WHEELS 'sw-ray' (WHEELS: the folder of the wheels that splatwizard-core came from)"
+    assert as_installed("pip install sw-kit") == (
+        "pip install --find-links WHEELS 'sw-kit' (WHEELS: the folder of the wheels that splatwizard-core came from)"
     )
 
 

@@ -9,6 +9,8 @@ from pathlib import Path
 import click
 import pytest
 from sw_bench.running import plan_of_options
+from sw_gaussians.ply import export_ply
+from sw_gaussians.start import gaussians_from_points
 
 from splatwizard_core import steps as api
 from splatwizard_core.api import UserInputError
@@ -103,3 +105,27 @@ def test_a_sweep_without_a_scene_is_about_that_of_its_start(run: Path, tmp_path:
     given = context.command.make_context("bench", words).params
     given.pop("plan"), given.pop("train_shared")
     assert plan_of_options(None, given).plan.scenes == ("demo:tiny",)
+
+
+def test_a_training_from_a_file_of_gaussians_tells_what_it_starts_from(tmp_path: Path, capsys):
+    start = tmp_path / "start.ply"
+    export_ply(gaussians_from_points(api.load_scene("demo:tiny").points), start)
+    words = ["train", "--method", "3dgs", "--scene", "demo:tiny", "--set", "iterations=1", "--out", str(tmp_path)]
+    assert main([*words, "--init", str(start)]) == 0
+    assert f"from {start} in place of the scene's points" in capsys.readouterr().err
+    assert main(words) == 2  # another training
+    assert main([*words, "--fresh"]) == 0
+    assert "in place of" not in capsys.readouterr().err
+
+
+def test_what_a_run_was_read_with_is_no_warning_when_it_is_measured_again(run: Path, capsys):
+    config = run / "config.toml"
+    config.write_text(config.read_text().replace('principal_point = "none"', 'principal_point = "file"'))
+    words = ["--no-speed", "--metrics", "psnr", "--json"]
+    for told, given in (
+        (False, ["eval", str(run / "scene.swz"), *words]),
+        (True, ["eval", str(run / "scene.swz"), *words, "--set", "principal_point=file"]),
+        (True, ["eval", str(run / "scene.swz"), *words, "--set", "mask_background=true"]),
+    ):
+        assert main(given) == 0
+        assert ("is of no use" in capsys.readouterr().err) == told

@@ -42,6 +42,8 @@ def register_entropy_models(registry):
 @hookimpl
 def register_coders(registry):
     registry.add("plain-points", "sw_parts_target:Points", summary="three integers each", codes="positions")
+    registry.add("plain-arrays", "sw_parts_target:Arrays", summary="zlib of all of it", codes="arrays")
+    registry.add("no-floats", "sw_parts_target:NoFloats", summary="of integers alone", codes="arrays")
 """
 PARTS_TARGET = """
 import zlib
@@ -81,6 +83,21 @@ class Points:
         if len(data) > 12 * self.max_points or len(data) % 12:
             raise BitstreamError("too many points")
         return np.frombuffer(data, "<i4").reshape(-1, 3).astype(np.int64)
+
+class Arrays:
+    def encode(self, array):
+        return zlib.compress(np.ascontiguousarray(array).tobytes())
+
+    def decode(self, data, dtype, shape):
+        size = np.dtype(dtype).itemsize * int(np.prod(shape))
+        found = zlib.decompressobj().decompress(data, size + 1)
+        if len(found) != size:
+            raise BitstreamError("another size")
+        return np.frombuffer(found, dtype).reshape(shape)
+
+class NoFloats(Arrays):
+    def encode(self, array):
+        return super().encode(array.astype(np.int64).astype(array.dtype))
 """
 SHORT = ("--scene", "demo:tiny", "--set", "iterations=4", "--json")
 CHOSEN = ("--set", "codec.settings.entropy=zipped", "--set", "codec.settings.positions=plain-points")
@@ -158,3 +175,37 @@ def test_a_part_that_cannot_serve_is_told_before_anything_is_trained(site, part,
     assert done.returncode == 2
     assert said in done.stderr
     assert not list((site.folder / "none").glob("**/checkpoints"))
+
+
+VECTORS = {"codec.settings.entropy": "zipped", "codec.settings.arrays": "plain-arrays"}
+IN_FILES = {
+    "lightgaussian": (("--method", "lightgaussian"), VECTORS),
+    "gaussians-zstd": (
+        ("--method", "trimming-the-fat", "--set", "codec=gaussians-zstd"),
+        {"codec.settings.means": "plain-arrays", "codec.settings.arrays": "plain-arrays"},
+    ),
+    "chimerags": (
+        ("--method", "chimerags", "--set", "distill.iterations=4", "--set", "train.method=3dgs"),
+        {**VECTORS, "arrays": "plain-arrays"},
+    ),
+}
+
+
+@pytest.mark.parametrize("method", IN_FILES)
+def test_files_of_other_methods_take_parts_by_name_too(site, method):
+    words, parts = IN_FILES[method]
+    small = () if method == "gaussians-zstd" else ("--set", "codec.settings.iterations=3")
+    usual = json.loads(site.sw("run", *words, *small, *SHORT, "--out", "others").stdout)["runs"][0]
+    chosen = [word for key, name in parts.items() for word in ("--set", f"{key}={name}")]
+    site.sw("encode", usual["directory"], *chosen, "--out", "chosen.swz", "--no-psnr")
+    info = json.loads(site.sw("info", "chosen.swz", "--json").stdout)
+    assert info["requires"]["sw-parts"] == "0.1"
+    assert info["static"]["arrays"] == "plain-arrays"
+    assert "sw-parts" not in json.loads(site.sw("info", f"{usual['directory']}/scene.swz", "--json").stdout)["requires"]
+    decoded = json.loads(site.sw("decode", "chosen.swz", "--json").stdout)
+    assert decoded["digest"] == usual["record"]["file"]["digest"]  # the parts lose nothing
+    badly = {"codec.settings.entropy": "zipped-badly", "codec.settings.means": "no-floats", "arrays": "no-floats"}
+    for key in badly.keys() & parts.keys():
+        done = site.sw("encode", usual["directory"], "--set", f"{key}={badly[key]}", "--out", "no.swz", check=False)
+        assert done.returncode == 2
+        assert f"'{badly[key]}' of sw-parts 0.1 cannot serve as {key}" in done.stderr

@@ -1,5 +1,7 @@
 """Write the core's catalogue.json: kind -> name -> distribution, of everything that packages of this project register.
 
+`superseded` in it names the distributions whose import paths a package brings besides its own.
+
     .venv/bin/python tools/make_catalogue.py
 
 Run it where all packages of the workspace are installed, after a package gained, lost or renamed an entry.
@@ -29,6 +31,9 @@ def generate() -> str:
         for kind, registry in plugins.registries.items()
     }
     defaults = {kind: registry.default for kind, registry in plugins.registries.items()}
+    brought = sorted(ROOT.glob("plugins/*/src/sw_*/__init__.py"))
+    homes = {path.parent.name.replace("_", "-"): path.parents[2].name for path in brought}
+    found["superseded"] = {name: home for name, home in homes.items() if name != home}
     found["default"] = {kind: found[kind][name] for kind, name in defaults.items() if name is not None}
     return json.dumps({kind: names for kind, names in found.items() if names}, indent=1, sort_keys=True) + "\n"
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 from sw_anchors.anchors import AnchorModel
 from sw_anchors.coded_anchors import CodedAnchors
+from sw_anchors.fast.networks import network_outputs
 from sw_anchors.params import AnchorGrowth, AnchorParams, CodedAnchorLearningRates, CodedAnchorParams
 from sw_anchors.stage import AnchorStage, CodedAnchorStage
 from sw_gaussians.resolution import ResolutionPlan, ResolutionSampler
@@ -186,6 +187,29 @@ def test_the_opacity_network_may_wait_until_anchors_are_judged():
     assert early.learning_rates(1501) == after
     shortened = AnchorStage(AnchorParams(lr=lr, iterations=300, scale_schedule=True))  # a hundredth of 30,000 steps
     assert shortened.learning_rates(15)["mlp_opacity"] < shortened.learning_rates(16)["mlp_opacity"]
+
+
+def visible_offsets(seed, **config):
+    """Numbers of offsets that a fresh model's anchors show."""
+    points = torch.rand(40, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    model = AnchorModel.from_points(PointCloud(points), voxel_size=0.05, num_offsets=6, feature_dim=4, hidden=6,
+                                    generator=torch.Generator().manual_seed(seed))  # fmt: skip
+    begin(AnchorStage(AnchorParams(**config)), model)
+    a = model.attributes(torch.arange(model.num_rows))
+    networks = (model.mlp_opacity, model.mlp_cov, model.mlp_color)
+    opacities, *_ = network_outputs(torch.tensor([0.3, -2.0, 1.0]), a.positions, a.features, networks)
+    return (opacities.view(model.num_rows, -1) > 0).sum(1).unique().tolist()
+
+
+def test_half_of_the_offsets_are_visible_at_the_start_whatever_the_seed():
+    assert all(visible_offsets(seed, paired_offsets=True) == [3] for seed in range(5))
+    assert len({tuple(visible_offsets(seed)) for seed in range(5)}) > 1
+
+
+def test_backgrounds_are_random_up_to_a_step_of_the_plan():
+    stage = AnchorStage(AnchorParams(random_background_until=1500, iterations=300, scale_schedule=True))
+    assert [step for step in range(1, 30) if stage.random_background(step)] == list(range(1, 16))
+    assert not AnchorStage(AnchorParams()).random_background(1)
 
 
 def test_pictures_may_begin_small():

@@ -83,7 +83,7 @@ def test_the_same_command_goes_on_with_what_is_not_finished(swept, capsys):
     folder, _ = swept
     assert main(["bench", str(folder / "plan.toml"), "--out", str(folder / "out"), "--dry-run", "--no-probe"]) == 0
     told = capsys.readouterr()
-    assert "2 runs of 1 method x 2 scenes x 1 seed: 1 finished, 1 new; 1 processes" in told.err
+    assert "2 runs of 1 method x 2 scenes x 1 seed: 1 finished, 1 new; 1 process," in told.err
     assert "spoilt" in told.out
     assert "demo:tiny" not in told.out
 

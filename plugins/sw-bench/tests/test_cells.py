@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from sw_bench.cells import Layout, cells_of, differing_bases, jobs_of, prepare, run_job
+from sw_bench.cells import Layout, cells_of, differing_bases, jobs_of, prepare, run_job, training_key
 from sw_bench.estimates import Estimates
 from sw_bench.plan import checked_plan
 from sw_bench.probe import probe_into
+from sw_bench.state import left_to_do
 
 from splatwizard_core.api import ConfigError
-from splatwizard_core.tooling import load_plugins
+from splatwizard_core.tooling import load_plugins, write_json
 
 pytest.importorskip("sw_lightgaussian", reason="the plans need methods that start from a trained scene")
 SHORT = {"iterations": 20, "pretrained.iterations": 20}
@@ -120,9 +121,20 @@ def test_what_a_plan_says_of_all_methods_also_trains_what_they_start_from(tmp_pa
     assert dict(cells[1].resolved.pretrained) == {"iterations": 20}
     assert [job.shared is not None for job in jobs] == [True, False, False]  # 3dgs itself is that scene
     assert not differing_bases(cells, load_plugins())
-    assert (
-        "lightgaussian: the trained scene that it starts from has pretrained.iterations=20" in capsys.readouterr().err
-    )
+    assert "lightgaussian: the trained scene that it starts from has iterations=20 too" in capsys.readouterr().err
+
+
+def test_a_finished_training_for_several_is_no_process_to_go(tmp_path):
+    _, jobs, _ = planned(tmp_path, methods=["3dgs", "lightgaussian"], set={"iterations": 20})
+    shared = jobs[0].shared
+    assert [len(left_to_do(jobs)), jobs[2].needs] == [3, (jobs[0],)]
+    (home := tmp_path / "home").mkdir()
+    write_json(home / "steps.json", {"train": {}})
+    shared.note.parent.mkdir(parents=True)
+    write_json(shared.note, {"directory": str(home)})
+    assert len(left_to_do(jobs, {training_key(shared.resolved)})) == 3  # about to be discarded
+    assert left_to_do(jobs) == jobs[1:]
+    assert [job.needs for job in jobs[1:]] == [(), ()]
 
 
 @pytest.mark.parametrize("where", ["scene", "override"])
@@ -133,12 +145,12 @@ def test_so_does_what_is_said_of_all_methods_on_one_scene(where, tmp_path):
     assert dict(cells[1].resolved.pretrained) == {"iterations": 20}
 
 
-def test_what_is_said_of_one_method_or_only_encodes_trains_nothing_else(tmp_path):
+def test_so_does_what_is_said_of_one_method_and_nothing_that_only_encodes(tmp_path):
     own = {"lightgaussian": {"set": {"iterations": 20}}}
     cells, _, _ = planned(tmp_path, methods=["3dgs", "lightgaussian"], set={}, method=own)
-    assert not cells[1].resolved.pretrained
+    assert dict(cells[1].resolved.pretrained) == {"iterations": 20}
     (cell,), _, _ = planned(tmp_path, methods=["lightgaussian"], set={"iterations": 20})
-    assert not cell.resolved.pretrained
+    assert cell.resolved.pretrained == cells[1].resolved.pretrained
     cells, _, _ = planned(tmp_path, methods=["3dgs", "spz"], set={"codec": "gaussians-exact"})
     assert not cells[1].resolved.pretrained
 

@@ -17,6 +17,7 @@ from sw_bench import local
 from sw_bench.executor import LOST, Site
 from sw_bench.local import LocalExecutor, LocalOptions
 
+from splatwizard_core import __version__
 from splatwizard_core.api import UserInputError
 
 WAITS = "import sys; print('began', flush=True); sys.stdin.read(); print('told to end')"
@@ -117,7 +118,7 @@ def test_a_process_of_a_sweep_is_sw_and_waits_for_who_holds_its_directory(tmp_pa
         assert b"waiting: " in process.stderr.readline()
         assert process.poll() is None
     assert process.stdout is not None
-    assert process.stdout.read().split() == [b"0.2.0"]  # its input stays open meanwhile: its owner is there
+    assert process.stdout.read().split() == [__version__.encode()]  # its input stays open meanwhile: its owner is there
     assert process.wait() == 0
 
 

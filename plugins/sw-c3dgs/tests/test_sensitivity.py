@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from sw_finetuning.pruning import scores_of
+from sw_gaussians.finetune.pruning import scores_of
 
 from splatwizard_core.api import SH, CameraIterator, GaussianInputs, GaussianModel, RasterOptions
 from sw_c3dgs.sensitivity import Sensitivity, sensitivities

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from sw_finetuning.fine_tuning import FineTuningRates, FineTuningStage
+from sw_gaussians.finetune.fine_tuning import FineTuningRates, FineTuningStage
 from sw_gaussians.start import gaussians_from_points
 
 from splatwizard_core.method import Method

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 from sw_datasets.gate import same_shape
+from sw_datasets.loaders.colmap_model import ColmapCamera
 
 from splatwizard_core.errors import SceneError
 
@@ -93,7 +95,46 @@ def test_a_half_turn_that_no_size_can_tell_of_is_not_applied_and_told(folder, lo
     root = folder()
     for file in pictures(root):
         save(file, QUARTERS, 3)
-    assert any("10 pictures have an EXIF orientation, which is not applied" in line for line in load(root).warnings)
+    told = [
+        line for line in load(root).warnings if "10 pictures have an EXIF orientation, which is not applied" in line
+    ]
+    assert "(exif_turn = true turns them, false leaves them)" in told[0]
+
+
+@pytest.mark.parametrize("orientation", [3, 6])
+def test_the_user_decides_about_a_turn_that_no_size_can_tell_of(colmap_folder, load, orientation):
+    colmap_folder.picture_size = (32, 32)
+    colmap_folder.camera = ColmapCamera(1, "PINHOLE", 32, 32, (30.0, 30.0, 16.0, 16.0))
+    root, corners = colmap_folder.write(), np.zeros((32, 32, 3), np.uint8)
+    corners[:16, :16] = 250
+    for file in pictures(root):
+        save(file, corners, orientation)
+    kept, turned = load(root, exif_turn=False), load(root, exif_turn=True)
+    assert not any("EXIF" in line for line in [*kept.warnings, *turned.warnings])
+    y, x = {3: (30, 30), 6: (2, 30)}[orientation]
+    assert (kept.train[0].pixels[0, 2, 2], turned.train[0].pixels[0, y, x]) == (250, 250)
+    assert (kept.train[0].pixels[0, y, x], turned.train[0].pixels[0, 2, 2]) == (0, 0)
+    assert not kept.protocol.turned
+    assert turned.protocol.id == f"{kept.protocol.id}/turned"
+
+
+@pytest.mark.parametrize("content", ["another shape", "no picture"])
+def test_a_mask_that_fits_no_picture_refuses_only_a_scene_that_uses_masks(folder, load, content):
+    root = folder()
+    masks = root / "masks" / ("images" if (root / "transforms.json").exists() else "")
+    masks.mkdir(parents=True)
+    for file in pictures(root):
+        Image.new("L", (32, 24), 255).save(masks / file.name)
+    odd = masks / "003.png"
+    Image.new("L", (24, 32)).save(odd) if content == "another shape" else odd.write_text("no picture")
+    words = {
+        "another shape": r"the mask 003\.png is 24x32 px, its image '.*003\.png' 32x24: they differ in aspect",
+        "no picture": r"003\.png: not a readable picture",
+    }[content]
+    (told,) = (line for line in load(root).warnings if "left out" in line)
+    assert re.fullmatch(f"1 masks are left out: .*{words}.*", told)
+    with pytest.raises(SceneError, match=words):
+        load(root, mask_background=True)
 
 
 @pytest.mark.parametrize(
@@ -113,8 +154,6 @@ def test_a_picture_of_another_shape_than_its_camera_is_refused(folder, load, siz
 
 
 def test_a_picture_that_is_a_little_stretched_is_told(colmap_folder, load):
-    from sw_datasets.loaders.colmap_model import ColmapCamera
-
     colmap_folder.camera = ColmapCamera(1, "PINHOLE", 1000, 1000, (900.0, 900.0, 500.0, 500.0))
     colmap_folder.picture_size = (1000, 994)
     assert (
@@ -166,15 +205,6 @@ def test_masks_that_transforms_name_are_found_or_missed(colmap_folder, load):
     scene = load(root)
     assert any("1 masks that 'mask_path' names are not there" in line for line in scene.warnings)
     assert any("the masks of 9 pictures are not used" in line for line in scene.warnings)
-
-
-def test_a_mask_of_another_shape_is_refused(folder, load):
-    root = folder()
-    below = "images/" if (root / "transforms.json").exists() else ""
-    (root / "masks" / below).mkdir(parents=True)
-    Image.new("L", (24, 32)).save(root / "masks" / below / "003.png")
-    with pytest.raises(SceneError, match=r"the mask 003\.png is 24x32 px, its image '.*003\.png' 32x24: they differ"):
-        load(root)
 
 
 def test_a_pipe_is_no_picture(folder, load):

@@ -95,7 +95,7 @@ def test_unicode_forms_are_one_name(colmap_folder, load, tmp_path):
         ('{"train": ["000.png"], "test": ["000.png"]}', "'000.png' is to be trained and tested"),
         ('{"train": [0], "test": [1]}', "'train' must be a list of names"),
         ('{"views": []}', "neither 'train' nor 'test'"),
-        ("[" * 100_000, "not readable JSON"),
+        ("[" * 100_000, "not readable JSON .its brackets are nested too deeply"),
         ("\n".join(f"{i:03d}.png" for i in range(10)), "gives 0 to train and 10 to test"),
     ],
 )

@@ -135,3 +135,12 @@ def test_a_damaged_file_is_told_in_one_line(tmp_path: Path, damage: str):
     with pytest.raises(UserInputError, match=r"mesh\.ply: ") as caught:
         read_mesh(path)
     assert "\n" not in str(caught.value)
+
+
+def test_in_the_world_a_vertex_keeps_its_place_to_the_millimetre(tmp_path):
+    origin = (448_000.0, 5_411_000.0, 300.0)  # as UTM has it: a float32 has steps of half a metre there
+    mesh = Mesh(np.array([[0.001, 0.25, 1.0], [1.0, 0.0, 0.5], [0.0, 1.0, 0.125]]), np.array([[0, 1, 2]]))
+    write_mesh(mesh, tmp_path / "world.ply", origin)
+    assert b"comment world_coordinates 448000.0 5411000.0 300.0\n" in (tmp_path / "world.ply").read_bytes()
+    found = read_mesh(tmp_path / "world.ply").vertices - origin
+    np.testing.assert_allclose(found, mesh.vertices, atol=1e-9)  # doubles have steps of 1e-9 there

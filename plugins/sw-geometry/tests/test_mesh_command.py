@@ -5,9 +5,12 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+from sw_datasets.demo import dataset as demo
 from sw_geometry.command import _target
 from sw_geometry.open3d_import import import_open3d
 from sw_geometry.ply import read_mesh
@@ -137,6 +140,22 @@ def test_a_file_for_the_mesh_is_written_and_nothing_else(run, open3d, tmp_path, 
     assert facts["triangles_post"] == len(read_mesh(target))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["r3", "surface.ply"]
     assert not (run / "mesh").exists()
+
+
+def test_a_mesh_of_a_scene_that_was_moved_can_be_moved_back(run, open3d, tmp_path, capsys, monkeypatch):
+    """As `sw export --world` does."""
+    words, far = ["mesh", str(run), *COARSE, "--out"], (448_000.0, 5_411_000.0, 300.0)
+    assert main([*words, str(tmp_path / "near.ply")]) == 0
+    load = demo.DemoDataset.load
+    monkeypatch.setattr(demo.DemoDataset, "load", lambda *given: replace(load(*given), origin=far))
+    capsys.readouterr()
+    assert main([*words, str(tmp_path / "local.ply")]) == 0
+    assert f"local origin, which lies at {far} (--world adds it)" in capsys.readouterr().out
+    assert main([*words, str(tmp_path / "world.ply"), "--world"]) == 0
+    assert "--world" not in capsys.readouterr().out
+    near, local, world = (read_mesh(tmp_path / f"{name}.ply") for name in ("near", "local", "world"))
+    np.testing.assert_allclose(local.vertices, near.vertices, atol=1e-6)
+    np.testing.assert_allclose(world.vertices - far, near.vertices, atol=1e-6)
 
 
 def test_a_file_is_told_from_a_folder_by_its_suffix(tmp_path):

@@ -40,8 +40,10 @@ def test_synthetic_scenes_are_black_in_the_protocol_too():
 
 @pytest.mark.parametrize("scene", ["nerf_synthetic/lego", "blender:a/folder"])
 def test_the_opacity_network_waits_where_points_are_random(scene):
-    assert resolved(scene).config.lr.mlp_opacity_early == RANDOM_START["lr.mlp_opacity_early"] < 1
-    assert resolved("tandt/truck").config.lr.mlp_opacity_early == 1
+    random, given = resolved(scene).config, resolved("tandt/truck").config
+    assert random.lr.mlp_opacity_early == RANDOM_START["lr.mlp_opacity_early"] < given.lr.mlp_opacity_early == 1
+    assert random.paired_offsets > given.paired_offsets
+    assert random.random_background_until == 1_500 > given.random_background_until == 0
 
 
 def test_the_user_and_other_presets_come_first():

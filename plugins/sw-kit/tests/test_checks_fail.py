@@ -42,7 +42,7 @@ def entry_of(monkeypatch):
 def installed(tmp_path, monkeypatch):
     """installed(source, requires): a distribution sw-bad with one module sw_bad."""
 
-    def make(source, requires=("splatwizard-core>=0.2,<0.3",)):
+    def make(source, requires=("splatwizard-core>=0.3,<0.4",)):
         (tmp_path / "sw_bad.py").write_text(source)
         info = tmp_path / "sw_bad-0.1.dist-info"
         info.mkdir()

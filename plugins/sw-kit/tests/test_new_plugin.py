@@ -108,9 +108,9 @@ def test_templates_state_the_versions_that_this_project_has():
     version = load_plugins().plugins[0].version
     for kind in kinds().values():
         ours = [line for line in kind.dependencies if line.startswith("sw-")]
-        for line in (*ours, "splatwizard-core>=0.2,<0.3"):
+        for line in (*ours, "splatwizard-core>=0.3,<0.4"):
             assert Requirement(line).specifier.contains(version), line
-    assert '"splatwizard-core>=0.2,<0.3"' in (templates.ROOT / "common" / "pyproject.toml.tmpl").read_text()
+    assert '"splatwizard-core>=0.3,<0.4"' in (templates.ROOT / "common" / "pyproject.toml.tmpl").read_text()
 
 
 def test_the_example_of_a_third_party_is_such_a_package():

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from sw_finetuning.pruning import scores_of
+from sw_gaussians.finetune.pruning import scores_of
 from sw_kit.short_training import train_stages
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from sw_finetuning.fine_tuning import FineTuningStage
+from sw_gaussians.finetune.fine_tuning import FineTuningStage
 from sw_gaussians.start import gaussians_from_points
 
 from splatwizard_core.api import PointCloud

@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
-from sw_finetuning.pruning import lowest, removal_count
-from sw_finetuning.volume import volume_factor
+from sw_gaussians.finetune.pruning import lowest, removal_count
+from sw_gaussians.finetune.volume import volume_factor
 
 from splatwizard_core.gaussians.model import GaussianModel
 from sw_lightgaussian.significance import Significance, tiles_under

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from sw_finetuning.pruning import up_to
+from sw_gaussians.finetune.pruning import up_to
 
 from sw_mesongs.importance import Importance
 

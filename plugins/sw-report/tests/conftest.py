@@ -20,7 +20,7 @@ from splatwizard_core.runs.record import Record
 SIZE = (48, 32)  # width, height
 PROTOCOL = {
     "dataset": "colmap", "images": "images", "resolution": -1, "split": "every8", "background": "black",
-    "principal_point": "center", "quantize8": True, "masked": False, "composite8": False,
+    "principal_point": "center", "quantize8": True, "masked": False, "composite8": False, "turned": False,
 }  # fmt: skip
 UNKNOWN = {
     "memory.peak_reserved_bytes": "a CPU has none", "train.breakdown_s": "not profiled", "geometry": "not asked for",

@@ -128,7 +128,13 @@ def test_columns_are_chosen_in_order_for_every_table(make_curve, tmp_path, capsy
     heads = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| method")]
     assert heads == ["| method | MB | rate |", "| method | MB | rate |", "| method | MB | rate | scenes |"]
     assert main(["report", str(tmp_path), "--columns", "size,psrn"]) == 2
-    assert "--columns has no 'psrn': one or more of" in capsys.readouterr().err
+    assert "--columns has no 'psrn': did you mean 'psnr'? It knows" in capsys.readouterr().err
+    assert main(["report", str(tmp_path), "--columns", "nothing"]) == 2
+    assert "--columns has no 'nothing': one or more of" in capsys.readouterr().err
+    assert main(["report", str(tmp_path), "--markdown", "--columns", "size,steps"]) == 0
+    told = capsys.readouterr().out
+    assert main(["report", str(tmp_path), "--markdown", "--columns", "bytes,iterations"]) == 0  # as records say
+    assert capsys.readouterr().out == told
     assert main(["report", str(tmp_path), "--columns", "size", "--csv"]) == 2
 
 

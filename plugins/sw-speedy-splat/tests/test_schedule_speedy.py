@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from sw_finetuning.pruning import removal_count
+from sw_gaussians.finetune.pruning import removal_count
 from sw_gaussians.statistics import collect_statistics
 
 from splatwizard_core.errors import ConfigError

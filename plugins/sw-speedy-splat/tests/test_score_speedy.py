@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from sw_finetuning.pruning import lowest
+from sw_gaussians.finetune.pruning import lowest
 
 from splatwizard_core.gaussians.inputs import rgb_to_dc
 from splatwizard_core.gaussians.model import GaussianModel

@@ -2,5 +2,5 @@
 
 from splatwizard_native import lend
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 __all__, __getattr__ = lend(__name__, {"steps": "decode encode evaluate load_scene render run train"})

@@ -6,6 +6,7 @@ A message says what is wrong (with the value), where, and what to do, in one or 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 
 from splatwizard_native import ForeseenError
 
@@ -18,6 +19,13 @@ class UserInputError(SplatwizardError):
     """Wrong input: a path, key, value, scene or file. Exit status 2."""
 
     exit_status = 2
+
+
+def no_file(path: Path) -> str:
+    """Say why there is no file to read, for after its name: nothing is there, or what is has no size and no end."""
+    if path.exists() and not path.is_dir():
+        return "no file but a pipe or a device: write what comes out of it into a file first"
+    return "there is no such file"
 
 
 class ConfigError(UserInputError):

@@ -19,7 +19,7 @@ MODULES = {
     "runs.config": "ResolvedConfig resolve",
     "runs.identity": "recorded_hash",
     "runs.directory": "OWN_FILES RunRequest run_directory",
-    "runs.pretrained": "base_config first_scene for_starts make_method named_scenes useful_starts",
+    "runs.pretrained": "base_config first_scene make_method named_scenes useful_starts",
     "runs.training": "cached_directory",
     "runs.run": "run train_in",
     "runs.decode": "export_model exporter_of open_model read_gaussians",

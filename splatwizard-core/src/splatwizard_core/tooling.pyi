@@ -64,7 +64,6 @@ from splatwizard_core.runs.observers import StartedTraining as StartedTraining
 from splatwizard_core.runs.observers import TrainingObserver as TrainingObserver
 from splatwizard_core.runs.pretrained import base_config as base_config
 from splatwizard_core.runs.pretrained import first_scene as first_scene
-from splatwizard_core.runs.pretrained import for_starts as for_starts
 from splatwizard_core.runs.pretrained import make_method as make_method
 from splatwizard_core.runs.pretrained import named_scenes as named_scenes
 from splatwizard_core.runs.pretrained import useful_starts as useful_starts

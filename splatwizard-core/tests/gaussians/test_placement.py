@@ -9,6 +9,7 @@ from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import UserInputError
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.gaussians.placement import as_origin, in_world, origin_of, placed_in, with_origin, world_shift
+from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.scene.scene import Protocol, Scene
 
 FAR = (448262.0, 5411933.0, 35.0)
@@ -55,6 +56,8 @@ def test_the_world_is_asked_for_only_where_it_is_known():
     model = model_at()
     with pytest.raises(UserInputError, match=r"--world: m\.ply does not say where its origin lies"):
         in_world(model, "m.ply")
+    with pytest.raises(UserInputError, match=r"--world: m\.swz holds no explicit Gaussians .but Anchors.*sw bake"):
+        in_world(type("Anchors", (SplatModel,), {})(), "m.swz")
     with_origin(model, FAR)
     assert world_shift(model) is None
     assert world_shift(in_world(model, "m.ply")) == FAR

@@ -85,6 +85,17 @@ def test_a_file_of_names_is_told_by_its_whole_path_and_no_file_stands_in_for_a_r
     assert resolved("split=~nobody-of-this-name/list.txt").scene.split == "~nobody-of-this-name/list.txt"
 
 
+def test_a_file_of_names_counts_by_what_it_holds_not_by_where_it_lies(tmp_path):
+    hashes = []
+    for folder, names in (("a", "1.png"), ("b", "1.png"), ("c", "2.png")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "test.txt").write_text(names)
+        found = resolved(f"split={tmp_path / folder / 'test.txt'}")
+        hashes.append((found.config_hash(), found.training_hash()))
+    assert hashes[0] == hashes[1]
+    assert not set(hashes[0]) & set(hashes[2])
+
+
 def test_the_demo_scene_means_the_quick_preset_and_any_other_the_paper():
     assert resolved().preset == "quick"
     assert resolved(scene="demo:tiny").preset == "quick"

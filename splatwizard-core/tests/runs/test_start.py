@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -225,17 +226,25 @@ def test_of_several_methods_those_that_start_from_nothing_leave_it_to_the_others
     assert (pupil.pretrained, taught.pretrained) == ({"iterations": 3}, {})
 
 
-def test_what_is_set_for_several_methods_also_trains_what_one_of_them_starts_from(toy_plugins):
-    def resolved(*methods: str, sets: tuple[str, ...] = ("iterations=3", "codec.kind=f2", "log_every=5")):
-        return Choices(methods, sets=sets).resolve(toy_plugins)
+def test_what_is_set_also_trains_what_a_method_starts_from(toy_plugins, tmp_path):
+    def resolved(*methods: str, sets: tuple[str, ...] = ("iterations=3", "codec.kind=f2", "log_every=5"), **more):
+        return Choices(methods, sets=sets, **more).resolve(toy_plugins)
 
     plain, student = resolved("toy", "toy-student")
     assert (plain.config.iterations, dict(plain.pretrained)) == (3, {})
     assert (student.config.iterations, dict(student.pretrained)) == (3, {"iterations": 3})
     told: list[str] = []
     Choices(("toy",), preset="quick").settled([plain, student], toy_plugins, lambda each: None, told.append)
-    assert told == ["toy-student: the trained scene that it starts from has iterations=3 too"]
-    assert not resolved("toy-student")[0].pretrained  # said of it alone
+    about = "toy-student: the trained scene that it starts from has iterations=3 too"
+    assert told == [f"{about} (--set pretrained.KEY=VALUE decides)"]
+    (alone,) = resolved("toy-student")
+    assert alone == student
+    assert not resolved("toy-student", sets=("iterations=0",))[0].pretrained  # a trained scene has steps
+    (file := tmp_path / "some.toml").write_text("method = 'toy-student'\niterations = 3\n")
+    (said,) = resolved("toy-student", sets=(), config_file=str(file))
+    assert dict(said.pretrained) == {"iterations": 3}
+    file.write_text(replace(alone, pretrained={}).toml())  # of a run, whose table `pretrained` says it all
+    assert not resolved("toy-student", sets=(), config_file=str(file))[0].pretrained
     _, own = resolved("toy", "toy-student", sets=("iterations=3", "pretrained.iterations=5"))
     assert dict(own.pretrained) == {"iterations": 5}
 
@@ -244,6 +253,22 @@ def test_a_teacher_is_trained_as_asked(toy_plugins, tmp_path):
     found, _ = Run(toy_plugins, tmp_path).train("pretrained.iterations=2", method="toy-pupil")
     assert found.facts["pretraining"]["toy"]["steps"] == 2
     assert [phase["phase"] for phase in found.facts["phases"]] == ["train: toy", "train: taught"]
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
+def test_a_pipe_is_told_as_such(toy_plugins, tmp_path, capsys):
+    pipes = [tmp_path / "x.ply", tmp_path / "x.swz", tmp_path / "x"]
+    for pipe in pipes:
+        os.mkfifo(pipe)
+    told = "no file but a pipe or a device: write what comes out of it into a file first"
+    with pytest.raises(UserInputError, match=f"init: .*x.ply: {told}"):
+        check_model(str(pipes[0]))
+    training = ["train", "--method", "toy-student", "--out", str(tmp_path), "--set", "init_points=3", "--init"]
+    for words in (["info"], ["eval", "--scene", "demo:tiny"], ["decode", "--out", str(tmp_path / "y")], ["encode"],
+                  ["export"], training, [*training[:-1], "--scene"]):  # fmt: skip
+        for pipe in pipes:
+            assert main([*words, str(pipe), *(["y.ply"] if words == ["export"] else [])]) == 2
+            assert told in capsys.readouterr().err, (words, pipe)
 
 
 def test_an_interrupted_scene_is_gone_on_with(toy_plugins, tmp_path):
@@ -258,6 +283,7 @@ def test_an_interrupted_scene_is_gone_on_with(toy_plugins, tmp_path):
         train(invocation.session, RunRequest(base, tmp_path), directory, stop_after=2)
     trained_scene(invocation.session, "toy", resolved, tmp_path)
     assert "the trained toy scene for this configuration is not finished yet: going on with it first" in invocation.said
+    assert "going on after step 2 of 6" in invocation.said
 
 
 def test_an_ordinary_run_takes_what_others_started_from(toy_plugins, tmp_path):

@@ -65,6 +65,7 @@ if TYPE_CHECKING:
     from splatwizard_native.settings import cache_root as cache_root
     from splatwizard_native.settings import fast_enabled as fast_enabled
     from splatwizard_native.strict_json import dump_strict as dump_strict
+    from splatwizard_native.strict_json import json_reason as json_reason
     from splatwizard_native.strict_json import load_strict as load_strict
     from splatwizard_native.toolchain import find_compiler as find_compiler
     from splatwizard_native.work_clock import loading_time as loading_time
@@ -97,7 +98,7 @@ MODULES = {
     "random_states": "capture_random_states one_order_of_sums preserved_random_states restore_random_states seeded",
     "scalars": "Verdict read_scalars",
     "settings": "cache_root fast_enabled",
-    "strict_json": "dump_strict load_strict",
+    "strict_json": "dump_strict json_reason load_strict",
     "toolchain": "find_compiler",
     "work_clock": "loading_time work_time",
 }

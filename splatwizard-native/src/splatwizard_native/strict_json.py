@@ -34,6 +34,11 @@ def load_strict(data: bytes) -> Any:
     return value
 
 
+def json_reason(error: Exception) -> str:
+    """Say why text is no JSON, after what `json.loads` raised."""
+    return "its brackets are nested too deeply" if isinstance(error, RecursionError) else str(error)
+
+
 def check_json(value: Any, place: str = "", depth: int = 0) -> None:
     """Raise ValueError if `value` is not plain JSON data within the bounds of this module.
 

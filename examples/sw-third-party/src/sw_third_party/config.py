@@ -1,8 +1,8 @@
 """Hyper-parameters: default, bounds, unit."""
 
 from pydantic import Field
-from sw_finetuning.fine_tuning import FineTuningRates
 from sw_gaussians.choices import Choosing, CodecChoice
+from sw_gaussians.finetune.fine_tuning import FineTuningRates
 
 
 class OpacityPruneConfig(Choosing):

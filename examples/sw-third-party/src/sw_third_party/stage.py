@@ -2,8 +2,8 @@
 
 import torch
 from splatwizard_core.api import GaussianModel, OptimizationParams, PipelineParams, Scheduler, SplatOptimizer
-from sw_finetuning.fine_tuning import FineTuningStage
-from sw_finetuning.pruning import lowest, removal_count
+from sw_gaussians.finetune.fine_tuning import FineTuningStage
+from sw_gaussians.finetune.pruning import lowest, removal_count
 
 from sw_third_party.config import OpacityPruneConfig
 from sw_third_party.score import worth

@@ -1,3 +1,3 @@
 """3D Gaussian Splatting, the baseline method of Splatwizard."""
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"

@@ -10,7 +10,12 @@ from sw_gaussians.pictures import Pictures
 
 from splatwizard_core.api import OptimizationParams, Params, SameResult
 
-RANDOM_START: Mapping[str, Any] = {"init_points": 100_000, "lr.mlp_opacity_early": 0.1}
+RANDOM_START: Mapping[str, Any] = {
+    "init_points": 100_000,
+    "paired_offsets": True,
+    "random_background_until": 1_500,
+    "lr.mlp_opacity_early": 0.1,
+}
 """Start of scenes in the Blender layout, which as a rule come without points (docs/methods/hac.md).
 
 The authors of HAC draw 10,000 points where the folder holds none of an earlier 3DGS training, and take its 100,000
@@ -92,6 +97,17 @@ class AnchorParams(OptimizationParams):
     num_offsets: int = Field(10, ge=1, le=64, description="Gaussians an anchor can spawn")
     feature_dim: int = Field(50, ge=1, le=256, description="numbers in an anchor's feature")
     hidden: int = Field(50, ge=1, le=256, description="width of the networks that decode Gaussians")
+    paired_offsets: bool = Field(
+        False,
+        description="start the opacity network with weights of opposite sign for the second half of the offsets: "
+        "half of them are visible whatever the seed; false: random ones as published, 1 to 9 of 10, the same for all "
+        "anchors",
+    )
+    random_background_until: int = Field(
+        0,
+        ge=0,
+        description="a fresh background colour per step up to this one, so that black anchors in empty space are seen",
+    )
     lr: AnchorLearningRates = Field(AnchorLearningRates(), description="step sizes")
     growth: AnchorGrowth = Field(AnchorGrowth(), description="growing and pruning of anchors")
     loss: AnchorLoss = Field(AnchorLoss(), description="distortion and regularisers")

@@ -75,6 +75,8 @@ class AnchorStage(Stage):
             raise TypeError(f"stage '{self.name}' trains a {self.trains.__name__}, not a {type(model).__name__}")
         self.growth_draws = context.generator("growth")
         self.extent = context.scene.extent
+        if self.opt.paired_offsets:
+            model.pair_offsets()
         return model
 
     # Optimizer
@@ -162,6 +164,9 @@ class AnchorStage(Stage):
             log.scalar("pruned", report.pruned)
 
     # Loss
+
+    def random_background(self, step: int) -> bool:
+        return step <= self.at(self.opt.random_background_until)
 
     def raster_options(self, step: int, background: Tensor) -> RasterOptions:
         return RasterOptions(background=background, grad2d=True)

@@ -19,7 +19,6 @@ from splatwizard_core.tooling import (
     RunRequest,
     base_config,
     first_scene,
-    for_starts,
     load_scene,
     make_method,
     named_scenes,
@@ -213,14 +212,6 @@ def _resolved(
     if init is not None and os.path.exists(init):
         init = os.path.abspath(init)  # processes on other machines have other working directories
     choices = replace(choices, sets=tuple(set_words(given)), init=init)
-    if len({plan.method_of(each) for each in plan.methods}) > 1:
-        first = choices.resolve(plugins)[0]
-        alike = plan.keys_for_all(scene, seed, given)
-        alike += [key for key, source in first.provenance.items() if source == choices.config_file]
-        shared = for_starts(plugins, first, alike)
-        if shared:
-            tell(f"{label}: the trained scene that it starts from has {', '.join(set_words(shared))} as the plan says")
-        choices = replace(choices, sets=tuple(set_words({**shared, **given})))
     resolved = choices.settled(choices.resolve(plugins), plugins, load, tell)
     for each in resolved:
         load(each)  # it must be there

@@ -56,7 +56,8 @@ def dry_run(
         rows.append([job.name, ", ".join(told), "?" if seconds is None else duration(seconds)])
     print_table(["process", "state", "about"], rows, right=1)
     counted = ", ".join(f"{number} {name}" for name, number in counts.items() if number)
-    say(f"{len(cells)} runs of {plan_size(cells)}: {counted}; {len(jobs)} processes, {slots} at a time, "
+    processes = f"{len(jobs)} process{'es' * (len(jobs) != 1)}, {slots} at a time"
+    say(f"{len(cells)} runs of {plan_size(cells)}: {counted}; {processes}, "
         + ("of unknown length" if left is None else f"about {duration(left)} of training"))  # fmt: skip
 
 

@@ -130,15 +130,6 @@ class Plan(Values):
             found |= {name: value for name, value in given.items() if value is not None} | {"set": merged}
         return Values(**found)
 
-    def keys_for_all(self, scene: str, seed: int, given: Mapping[str, Any]) -> list[str]:
-        """Return those keys of a run's `set` whose value is said of all methods on its scene and seed."""
-        tables = [self, self.scene.get(scene, Values())]
-        tables += [each for each in self.override if not each.methods and each.meets("", scene, seed)]
-        said: dict[str, Any] = {}
-        for each in tables:
-            said |= each.set
-        return [key for key, value in given.items() if key in said and said[key] == value]
-
     def part(self, methods: Iterable[str], scenes: Iterable[str], seeds: Iterable[int]) -> Plan:
         """Return the plan with these methods, scenes and seeds alone; an empty one of them leaves all."""
         wanted: dict[str, tuple[Any, ...]] = {

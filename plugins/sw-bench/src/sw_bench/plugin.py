@@ -1,4 +1,4 @@
-"""Registers the command `sw bench` and the executors `local` and `slurm`."""
+"""Registers the command `sw bench` and the executors `local`, `slurm` and `ray`."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ def register_executors(registry: Registry) -> None:
                  summary="processes on this machine: one per GPU, or a share of the cores each")  # fmt: skip
     registry.add("slurm", "sw_bench.slurm:SlurmExecutor",
                  summary="jobs of a Slurm cluster, through submitit")  # fmt: skip
+    registry.add("ray", "sw_bench.ray_cluster:RayExecutor", summary="tasks of a Ray cluster")
 
 
 @hookimpl

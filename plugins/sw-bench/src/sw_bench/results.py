@@ -18,7 +18,8 @@ def results(cells: Sequence[Cell], index: Index) -> list[Facts]:
     """Return a row for each method, scene and rate point, in the order of the plan, as plain values.
 
     `metrics` and `bytes` are means over the finished seeds, with `deviations` (of the sample, n - 1) where there are
-    several; `failed` maps a seed to the reason, also of a finished run that could not be done again.
+    several; `steps` are those of the trained scenes that a training started from or was taught by, and its own, None of
+    a scene from a file; `failed` maps a seed to the reason, also of a finished run that could not be done again.
     """
     groups: dict[tuple[str, str, str], list[Cell]] = {}
     for cell in cells:
@@ -35,12 +36,18 @@ def _row(label: str, scene: str, rate: str, group: Sequence[Cell], index: Index)
     return {
         "label": label, "method": group[0].resolved.method, "scene": scene, "rate": rate,
         "seeds": sorted(records),
+        "steps": next(map(_steps, records.values()), []),
         "directories": [str(cell.directory) for cell in group],
         "means": {name: statistics.fmean(each) for name, each in values.items() if each},
         "deviations": {name: statistics.stdev(each) for name, each in values.items() if len(each) > 1},
         "failed": {str(seed): row.reason for seed, row in states.items() if row.status == "failed"},
         "waiting": [seed for seed, row in states.items() if row.status != "failed" and seed not in records],
     }  # fmt: skip
+
+
+def _steps(record: Record) -> list[int | None]:
+    """Steps of the trained scenes that a run started from or was taught by, and its own."""
+    return [*(scene.steps for scene in record.train.pretraining.values()), record.train.steps]
 
 
 def _shared_metrics(records: Sequence[Record]) -> list[str]:
@@ -61,13 +68,15 @@ def table_of(rows: Sequence[Facts], plugins: PluginManager) -> tuple[list[str], 
     several = len({seed for row in rows for seed in row["seeds"]}) > 1
     headings = ["method", "scene", "rate", *(["n"] if several else [])]
     remarks = any(map(_remark, rows))
-    headings += [infos[name].label if name in infos else name for name in names] + ["MB", *([""] if remarks else [])]
+    headings += [infos[name].label if name in infos else name for name in names]
+    headings += ["MB", "steps", *([""] if remarks else [])]
     lines = []
     for row in rows:
         cells = [row["label"], row["scene"], row["rate"], *([str(len(row["seeds"]))] if several else [])]
         for name in names:
             cells.append(_number(row, name, infos[name].digits if name in infos else 4, 1.0))
-        lines.append([*cells, _number(row, "bytes", 3, 1e-6), *([_remark(row)] if remarks else [])])
+        steps = " + ".join("file" if each is None else f"{each:,}" for each in row["steps"])
+        lines.append([*cells, _number(row, "bytes", 3, 1e-6), steps or "-", *([_remark(row)] if remarks else [])])
     return headings, lines
 
 

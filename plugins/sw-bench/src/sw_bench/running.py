@@ -31,7 +31,7 @@ from sw_bench.executor import Executor, Site
 from sw_bench.index import Index
 from sw_bench.plan import Plan, checked_plan, read_plan
 from sw_bench.results import results, table_of
-from sw_bench.state import State, changes_of, discard, discard_shared, state_of
+from sw_bench.state import State, changes_of, discard, discard_shared, left_to_do, state_of
 from sw_bench.sweep import Sweep
 
 NAMED = 5  # runs that a message names
@@ -166,9 +166,11 @@ def bench_plan(wanted: Wanted, given: Mapping[str, Any]) -> int:
     jobs = jobs_of(unfinished, layout, plugins)
     for line in differing_bases(cells, plugins):
         say(f"note: {line}")
+    own = set[str]() if given.get("resume", True) else {cell.training for cell in cells}
     if given["dry_run"]:
         from sw_bench.dry_run import dry_run
 
+        jobs = left_to_do(jobs, own)
         executor = None if plan.executor != LOCAL else make_executor(plan, layout, plugins)
         dry_run(jobs, cells, states, layout, executor, probe=given["probe"], as_json=given["as_json"])
         return 0
@@ -182,11 +184,10 @@ def bench_plan(wanted: Wanted, given: Mapping[str, Any]) -> int:
         for cell in unfinished:
             if states[cell] is State.CHANGED:
                 discard(cell)
-        if not given.get("resume", True):
-            own = {cell.training for cell in cells}
-            for job in jobs:
-                if job.shared is not None and training_key(job.shared.resolved) in own:
-                    discard_shared(job.shared)
+        for job in jobs:
+            if job.shared is not None and training_key(job.shared.resolved) in own:
+                discard_shared(job.shared)
+        jobs = left_to_do(jobs)
         prepare(jobs, layout)
         estimates = Estimates(index.durations())
         finished = [cell for cell in cells if states[cell] is State.FINISHED]
@@ -257,7 +258,7 @@ def _counts(cells: Sequence[Cell], states: Mapping[Cell, State], jobs: Sequence[
     count = {state: sum(each is state for each in states.values()) for state in State}
     parts = [f"{number} {state.value}" for state, number in count.items() if number]
     places = "" if executor.slots is None else f", {executor.slots} at a time"
-    return f"{len(cells)} runs: {', '.join(parts)}; {len(jobs)} processes to go{places}"
+    return f"{len(cells)} runs: {', '.join(parts)}; {len(jobs)} process{'es' * (len(jobs) != 1)} to go{places}"
 
 
 def _about_changed(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Container, Sequence
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from splatwizard_core.tooling import (
     recorded_hash,
 )
 from splatwizard_native import remove_folder
-from sw_bench.cells import TRAINED, Cell, SharedTraining, training_key
+from sw_bench.cells import TRAINED, Cell, Job, SharedTraining, training_key
 
 CONFIG = "config.toml"
 STEPS = "steps.json"
@@ -135,6 +136,21 @@ def is_shared_training_done(shared: SharedTraining) -> bool:
     """Whether a training for several was finished, and is still there."""
     directory = _noted(shared)
     return directory is not None and is_trained(directory)
+
+
+def left_to_do(jobs: Sequence[Job], again: Container[str] = ()) -> list[Job]:
+    """Return the jobs without finished trainings for several, which then nothing has to wait for.
+
+    again       `cells.training_key` of trainings that are about to be discarded
+    """
+    done = {
+        job for job in jobs
+        if job.shared is not None and training_key(job.shared.resolved) not in again
+        and is_shared_training_done(job.shared)
+    }  # fmt: skip
+    for job in jobs:
+        job.needs = tuple(need for need in job.needs if need not in done)
+    return [job for job in jobs if job not in done]
 
 
 def _noted(shared: SharedTraining) -> Path | None:

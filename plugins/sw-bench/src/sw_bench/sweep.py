@@ -59,10 +59,6 @@ class Sweep:
         self.waiting = list(self.jobs)
         stamps = {cell: stamp_of(cell) for job in self.jobs for cell in job.cells}
         self.before = {cell: stamp for cell, stamp in stamps.items() if stamp is not None}
-        for job in self.jobs:
-            if job.shared is not None and is_shared_training_done(job.shared):
-                self.waiting.remove(job)
-                self.done.add(job)
         try:
             ended: list[tuple[str, int, str]] = []
             while self.waiting or self.running:

@@ -3,8 +3,8 @@
 from typing import ClassVar
 
 from pydantic import Field
-from sw_finetuning.fine_tuning import FineTuningRates
 from sw_gaussians.choices import Choosing, CodecChoice
+from sw_gaussians.finetune.fine_tuning import FineTuningRates
 
 from splatwizard_core.api import Params
 from sw_codecs.codebooks.sharing import Training

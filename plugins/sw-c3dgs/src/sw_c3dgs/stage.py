@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sw_finetuning.fine_tuning import FineTuningStage
+from sw_gaussians.finetune.fine_tuning import FineTuningStage
 
 from splatwizard_core.api import CameraIterator, GaussianModel, SceneError
 from sw_c3dgs.compression import Compress

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
 from pydantic import Field
-from sw_finetuning.distillation import DistillLoss
-from sw_finetuning.fine_tuning import FineTuningRates
 from sw_gaussians.choices import Choice, Choosing, Moved, PrunerChoice
+from sw_gaussians.finetune.distillation import DistillLoss
+from sw_gaussians.finetune.fine_tuning import FineTuningRates
 
 from splatwizard_core.api import Params
 
@@ -82,7 +82,7 @@ _SHARED = {"training": "ema", "size": 8192, "iterations": 1_000, "batch": 80_000
 class ChimeraConfig(Choosing):
     """Everything that can be set for ChimeraGS."""
 
-    ENCODING: ClassVar[tuple[str, ...]] = ("codec", "steps", "xyz", "prefer", "vq")
+    ENCODING: ClassVar[tuple[str, ...]] = ("codec", "steps", "xyz", "arrays", "prefer", "vq")
     OLDER: ClassVar[Mapping[str, Moved]] = {
         "vq.codec": Moved(("codec.name",), "importance-vq"),
         "vq.ratio2": Moved(("codec.sh2.ratio",), 0.8, "importance-vq"),
@@ -102,6 +102,9 @@ class ChimeraConfig(Choosing):
     steps: Steps = Field(Steps(), description="roundings of what the file holds in float16")
     xyz: Literal["float32", "float16", "uniform16"] = Field(
         "float32", description="positions in the file: without loss, rounded, or on 2^16 steps of the bounding box"
+    )
+    arrays: str = Field(
+        "byte-planes", description="coder of what the file holds in float16 besides colours: any that codes such arrays"
     )
     prefer: list[str] = Field(
         ["flash", "tcgs", "speedy", "standard"],

@@ -11,6 +11,7 @@ Sections of a group `sh2`, `sh3`, rows in Morton order (docs/methods/chimerags.m
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,13 +21,17 @@ from torch import Tensor
 
 from splatwizard_core.api import BitstreamError, GaussianModel, SplatwizardError
 from sw_chimerags.model import DEGREE, LOWER, MaskedGaussians
+from sw_codecs.models.exchangeable import array_coder, codes_arrays
 
 if TYPE_CHECKING:
-    from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager, VectorCoder
+    from splatwizard_core.api import ArrayCoder, ContainerReader, ContainerWriter, PluginManager, VectorCoder
     from sw_chimerags.config import Steps
 
 GROUPS = {"sh2": LOWER, "sh3": (DEGREE + 1) ** 2 - 1}
 """Group -> coefficients behind band 0 that its Gaussians have, in the order of the decoded model."""
+
+USUAL = "byte-planes"
+"""The array coder of float16 where no other is named."""
 
 POSITIONS = ("float32", "float16", "uniform16")
 HALF_MAX = 65504.0
@@ -35,6 +40,8 @@ BITS = 16  # bits an axis of the positions `uniform16`
 ROW_BYTES = 4 * (3 + 8 + 3 * (DEGREE + 1) ** 2)  # of a decoded Gaussian
 
 Arrays = dict[str, NDArray[Any]]
+
+codes_halves = partial(codes_arrays, dtypes=[np.float16])
 
 
 def encode(
@@ -46,6 +53,7 @@ def encode(
     settings: Mapping[str, Mapping[str, Any]],
     steps: Steps,
     xyz: str,
+    arrays: str = USUAL,
 ) -> None:
     """Write both groups; the model stays as it is.
 
@@ -53,6 +61,7 @@ def encode(
     settings    group -> what its coder is made with
     steps       roundings before float16
     xyz         one of POSITIONS
+    arrays      name of the array coder of float16
 
     Raises PluginError for a coder that there is not, SplatwizardError for values that are not finite and for a model
     whose importance is not that of its Gaussians.
@@ -61,17 +70,20 @@ def encode(
         raise SplatwizardError(
             "the model was changed since the importance of its Gaussians was computed: `distill` computes it at its end"
         )
-    arrays = _rounded(_arrays(model), steps)
+    rows_of = _rounded(_arrays(model), steps)
     on = model.mask_on().cpu().numpy()
     writer.raster["sh_degree"] = DEGREE
     writer.static.update(num_gaussians=len(on), num_sh3=int(on.sum()), max_sh_degree=DEGREE, vq=coder, xyz=xyz)
+    if arrays != USUAL:
+        writer.static["arrays"] = arrays
+    planes = plugins.array_coders.load(arrays)()
     for group, rows in (("sh2", ~on), ("sh3", on)):
         if rows.any():
-            own = {name: array[rows] for name, array in arrays.items()}
+            own = {name: array[rows] for name, array in rows_of.items()}
             ordered = _in_order(own, plugins, BITS if xyz == "uniform16" else CELLS)
             vectors = plugins.vector_coders.load(coder)(plugins, **settings.get(group, {}))
             vectors.device = model.device  # a codebook is trained many times faster on the model's GPU
-            _write_group(group, ordered, writer, plugins, vectors, xyz)
+            _write_group(group, ordered, writer, plugins, vectors, xyz, planes)
     writer.allow(ROW_BYTES * len(on), f"a model of {len(on):,} Gaussians")
 
 
@@ -115,9 +127,9 @@ def _in_order(arrays: Arrays, plugins: PluginManager, bits: int) -> Arrays:
 
 
 def _write_group(
-    group: str, arrays: Arrays, writer: ContainerWriter, plugins: PluginManager, coder: VectorCoder, xyz: str
-) -> None:
-    planes = plugins.array_coders.load("byte-planes")()
+    group: str, arrays: Arrays, writer: ContainerWriter, plugins: PluginManager, coder: VectorCoder, xyz: str,
+    planes: ArrayCoder,
+) -> None:  # fmt: skip
     means, rest = arrays["means"], arrays["sh_rest"][:, : GROUPS[group]]
     if xyz == "float32":
         writer.add(f"{group}/xyz", plugins.array_coders.load("float-delta")().encode(means))
@@ -142,35 +154,41 @@ def decode(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
     reader.allow(ROW_BYTES * total, f"a model of {total:,} Gaussians")
     xyz = reader.text("xyz", choices=POSITIONS)
     coder = plugins.vector_coders.load(reader.text("vq", choices=plugins.vector_coders.names))(plugins)
-    groups = [_read_group(group, n, reader, plugins, coder, xyz) for group, n in (("sh2", total - on), ("sh3", on))]
+    planes = array_coder(reader, plugins, "arrays", USUAL)
+    groups = [
+        _read_group(group, n, reader, plugins, coder, xyz, planes) for group, n in (("sh2", total - on), ("sh3", on))
+    ]
     tensors = [torch.cat([group[i] for group in groups]) for i in range(len(GaussianModel.RAW))]
     return GaussianModel(*tensors, active_sh_degree=DEGREE)
 
 
 def _read_group(
-    group: str, n: int, reader: ContainerReader, plugins: PluginManager, coder: VectorCoder, xyz: str
-) -> list[Tensor]:
+    group: str, n: int, reader: ContainerReader, plugins: PluginManager, coder: VectorCoder, xyz: str,
+    planes: ArrayCoder,
+) -> list[Tensor]:  # fmt: skip
     """The tensors of a group in the order of RAW; bands that it lacks are zero."""
     rest = np.zeros((n, GROUPS["sh3"], 3), np.float32)
     if n == 0:
         vectors, attributes, means = np.zeros((0, 3 + 3 * GROUPS[group])), np.zeros((0, 8)), np.zeros((0, 3))
     else:
-        means = _positions(group, n, reader, plugins, xyz)
+        means = _positions(group, n, reader, plugins, xyz, planes)
         with reader.decoding(f"{group}/attributes") as data:
-            attributes = _finite(plugins.array_coders.load("byte-planes")().decode(data, np.float16, (n, 8)))
+            attributes = _finite(planes.decode(data, np.float16, (n, 8)))
         vectors = _vectors(group, n, 3 + 3 * GROUPS[group], reader, coder)
     rest[:, : GROUPS[group]] = vectors[:, 3:].reshape(n, 3, GROUPS[group]).transpose(0, 2, 1)
     found = (means, vectors[:, None, :3], rest, attributes[:, 0], attributes[:, 1:4], attributes[:, 4:])
-    return [torch.from_numpy(np.ascontiguousarray(array, np.float32)) for array in found]
+    return [torch.from_numpy(np.require(array, np.float32, ["C", "W"])) for array in found]
 
 
-def _positions(group: str, n: int, reader: ContainerReader, plugins: PluginManager, xyz: str) -> NDArray[Any]:
+def _positions(
+    group: str, n: int, reader: ContainerReader, plugins: PluginManager, xyz: str, planes: ArrayCoder
+) -> NDArray[Any]:
     if xyz == "float32":
         with reader.decoding(f"{group}/xyz") as data:
             return _finite(plugins.array_coders.load("float-delta")().decode(data, np.float32, (n, 3)))
     if xyz == "float16":
         with reader.decoding(f"{group}/xyz") as data:
-            return _finite(plugins.array_coders.load("byte-planes")().decode(data, np.float16, (n, 3)))
+            return _finite(planes.decode(data, np.float16, (n, 3)))
     low, high = reader.array(f"{group}/box", dtype="float64", shape=(2, 3), finite=True)
     with reader.decoding(f"{group}/xyz") as data:
         cells = plugins.position_codecs.load("octree")(max_points=n).decode(data)

@@ -11,6 +11,7 @@ from sw_chimerags.config import ChimeraConfig
 from sw_chimerags.model import MaskedGaussians
 from sw_chimerags.presets import PRESETS, RATES
 from sw_chimerags.stage import MaskedDistillation
+from sw_codecs.models.exchangeable import hold_part
 
 if TYPE_CHECKING:
     import torch
@@ -59,7 +60,10 @@ class ChimeraGS(Method):
         return self._student().create_model(scene, generator)
 
     def stages(self) -> Sequence[Stage]:
-        self.config.codec.provider(self.plugins, "codec.name")  # now, and not when all is trained
+        # Now, and not when all is trained.
+        self.config.codec.provider(self.plugins, "codec.name")
+        if self.config.arrays != file.USUAL:
+            hold_part(self.plugins.array_coders, self.config.arrays, "arrays", file.codes_halves)
         quantizer = self.plugins.quantizers.load("ste-mask")(self.config.mask.threshold)
         pruner = self.config.score.load(self.plugins, "score.pruner")  # how well the file keeps a Gaussian
         return [*self._student().stages(), MaskedDistillation(self.config, quantizer, pruner)]
@@ -71,7 +75,7 @@ class ChimeraGS(Method):
         groups = {"sh2": codec.sh2, "sh3": codec.sh3}
         file.encode(
             model, writer, self.plugins, coder=codec.name, steps=self.config.steps, xyz=self.config.xyz,
-            settings={group: {**codec.settings, **own} for group, own in groups.items()},
+            settings={group: {**codec.settings, **own} for group, own in groups.items()}, arrays=self.config.arrays,
         )  # fmt: skip
         if self.config.prefer:
             writer.raster["prefer"] = list(self.config.prefer)

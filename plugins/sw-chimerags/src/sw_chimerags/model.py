@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
-from sw_finetuning.importance import ScoredGaussians
+from sw_gaussians.finetune.importance import ScoredGaussians
 from sw_gaussians.surfels import refuse_surfels
 from torch import Tensor, nn
 

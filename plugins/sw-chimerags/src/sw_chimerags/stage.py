@@ -5,8 +5,8 @@ from __future__ import annotations
 import copy
 from typing import TYPE_CHECKING
 
-from sw_finetuning.distillation import DistillationStage, PseudoViewSampler
-from sw_finetuning.importance import KeepImportance
+from sw_gaussians.finetune.distillation import DistillationStage, PseudoViewSampler
+from sw_gaussians.finetune.importance import KeepImportance
 
 from splatwizard_core.api import (
     CameraIterator,

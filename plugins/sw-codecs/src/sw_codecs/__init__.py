@@ -1,3 +1,3 @@
 """Quantizers, entropy models, coders and position codecs for Splatwizard."""
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"

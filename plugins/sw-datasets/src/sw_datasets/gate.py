@@ -60,6 +60,7 @@ class Gate:
         self.cut = Counter[str]()
         self.seen = Counter[str]()
         self._unlike: tuple[float, str] = (0.0, "")
+        self._odd_mask = ""
 
     def admit(self, name: str, file: Path, camera_size: tuple[int, int] | None) -> Picture:
         """Hold a picture against the size (width, height) that its camera was made for; None: the scene does not say.
@@ -74,13 +75,11 @@ class Gate:
     def _turn(self, header: Header, name: str, camera_size: tuple[int, int] | None) -> int:
         stored, said = (header.width, header.height), header.orientation
         upright = _turned(header, said)
-        if camera_size is None:
-            self.seen["unsure turn"] += said != UPRIGHT
-            return UPRIGHT
-        if same_shape(stored, camera_size):
+        if camera_size is None or same_shape(stored, camera_size):
             # A camera that fits the stored pixels alone was made from them; one that fits both does not say.
-            self.seen["unsure turn"] += said != UPRIGHT and same_shape(upright, camera_size)
-            return UPRIGHT
+            unsure = said != UPRIGHT and (camera_size is None or same_shape(upright, camera_size))
+            self.seen["unsure turn"] += unsure
+            return said if unsure and self.rules.exif_turn else UPRIGHT
         if said != UPRIGHT and same_shape(upright, camera_size):
             self.seen["turned"] += 1
             return said
@@ -115,7 +114,16 @@ class Gate:
             camera = _centred(camera)
         cut_by_alpha = picture.has_alpha and (self.always_cut or rules.cuts_alpha)
         cut_by_mask = rules.masked is True and not picture.has_alpha
-        mask_turn = UPRIGHT if mask is None else self._mask_turn(name, mask, picture)
+        mask_turn = UPRIGHT
+        if mask is not None:
+            try:
+                mask_turn = self._mask_turn(name, mask, picture)
+            except SceneError as error:
+                if cut_by_mask or self.quiet_masks:
+                    raise
+                self._odd_mask = self._odd_mask or str(error).removeprefix(f"{self.scene}: ")
+                self.seen["odd masks"] += 1
+                mask = None
         load = partial(load_picture, file, size, alpha=cut_by_alpha, turn=turn)
         if cut_by_mask:
             if mask is None:
@@ -157,16 +165,21 @@ class Gate:
         """Whether pictures were cut out, beyond what the layout always does."""
         return bool(self.cut["mask"] or (self.cut["alpha"] and not self.always_cut))
 
+    @property
+    def turned(self) -> bool:
+        """Whether pictures were turned because the user said so."""
+        return bool(self.seen["unsure turn"] and self.rules.exif_turn)
+
     def warnings(self) -> list[str]:
         """List what was done, and what was found and not used, a line each."""
         seen, background = self.seen, self.rules.background
         found = []
         if count := seen["turned"]:
             found.append(f"{count} pictures are turned by their EXIF orientation, as the size of their cameras says")
-        if count := seen["unsure turn"]:
+        if (count := seen["unsure turn"]) and self.rules.exif_turn is None:
             found.append(
                 f"{count} pictures have an EXIF orientation, which is not applied: the size of their cameras does not "
-                "say whether the poses were made from turned pictures"
+                "say whether the poses were made from turned pictures (exif_turn = true turns them, false leaves them)"
             )
         if count := seen["stretched"]:
             found.append(f"{count} pictures differ from their cameras in aspect, the most: {self._unlike[1]}")
@@ -181,6 +194,8 @@ class Gate:
             found.append(
                 f"the masks of {count} pictures are not used (mask_background = true cuts the pictures out by them)"
             )
+        if count := seen["odd masks"]:
+            found.append(f"{count} masks are left out: {self._odd_mask}")
         if self.off_centre > 1 and self.rules.principal_point != "file":
             found.append(
                 f"the principal point is up to {self.off_centre:.1f} px off the image centre and is taken as the "

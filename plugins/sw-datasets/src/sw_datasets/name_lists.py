@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatwizard_core.api import SceneError, View
+from splatwizard_native import json_reason
 from sw_datasets.picture_names import name_key
 
 LARGEST = 16 << 20  # bytes of a list
@@ -56,7 +57,7 @@ def read_lists(path: Path) -> NameLists:
     try:
         content = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise SceneError(f"{path}: not readable JSON ({error})", path=str(path)) from error
+        raise SceneError(f"{path}: not readable JSON ({json_reason(error)})", path=str(path)) from error
     if isinstance(content, list):
         content = {"test": content}
     parts: dict[str, tuple[str, ...]] = {}

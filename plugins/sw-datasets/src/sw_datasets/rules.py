@@ -20,6 +20,7 @@ class Rules:
     asked       named protocol whose pictures are the default
     images      picture folder; None: the layout has none to choose
     masked      pictures are cut out by alpha or mask; None: by alpha, if the family composites it
+    exif_turn   as in SceneOptions
     finds_lists lists of names in the scene decide its split, as the user named none and nothing is published
     the rest    as in Protocol
     """
@@ -34,6 +35,7 @@ class Rules:
     principal_point: str
     masked: bool | None
     composite8: bool
+    exif_turn: bool | None
     finds_lists: bool = False
 
     @property
@@ -55,11 +57,12 @@ class Rules:
                 return name
         return "custom"
 
-    def protocol(self, label: str | None = None, *, masked: bool = False) -> Protocol:
+    def protocol(self, label: str | None = None, *, masked: bool = False, turned: bool = False) -> Protocol:
         """The protocol that the record keeps.
 
         label   stands for the picture folder where the layout has none
         masked  pictures were cut out by alpha or mask, beyond what the layout always does
+        turned  pictures were turned by EXIF because the user said so
         """
         return Protocol(
             self.family.name,
@@ -70,7 +73,8 @@ class Rules:
             principal_point=self.principal_point,
             masked=masked,
             composite8=self.composite8,
-            name=self.name if not masked else "custom",
+            turned=turned,
+            name="custom" if masked or turned else self.name,
         )
 
 
@@ -115,6 +119,7 @@ def rules_for(family: Family, folder: str, options: SceneOptions) -> Rules:
         options.principal_point or family.principal_point,
         options.mask_background,
         options.legacy_8bit_composite,
+        options.exif_turn,
         finds_lists=options.split is None and options.test_every is None and not family.scenes,
     )
 

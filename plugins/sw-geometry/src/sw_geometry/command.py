@@ -77,6 +77,9 @@ def _target(context: click.Context, parameter: click.Parameter, value: str | Non
     click.option("--units", type=click.Choice(["scene", "mm"]), default="scene", show_default=True,
                  help="DTU: units of the scene's cameras."),
     click.option("--chamfer", is_flag=True, help="Measure the mesh against the scene's truth, or DTU's."),
+    click.option("--world", is_flag=True,
+                 help="Write coordinates of the world that the scene's files are in, as doubles, where the scene was "
+                 "moved to a local origin."),
     click.option("--backend", type=click.Choice(["tensor", "legacy"]),
                  help="Class of Open3D that fuses; legacy needs Open3D before 0.20.  [default: tensor]"),
     click.option("--max-memory", type=LENGTH, metavar="GB",
@@ -86,8 +89,8 @@ def _target(context: click.Context, parameter: click.Parameter, value: str | Non
     set_option, json_option, debug_option,
 )  # fmt: skip
 def mesh(
-    file: str, scene: str | None, out: Path | None, no_mask: bool, units: str, chamfer: bool, device: str | None,
-    sets: tuple[str, ...], as_json: bool, **given: Any,
+    file: str, scene: str | None, out: Path | None, no_mask: bool, units: str, chamfer: bool, world: bool,
+    device: str | None, sets: tuple[str, ...], as_json: bool, **given: Any,
 ) -> None:  # fmt: skip
     """Make a mesh of FILE (.swz or .ply), or of the scene.swz in a run directory.
 
@@ -132,13 +135,13 @@ def mesh(
     scores, culled = _measured(subject, parameters, settings, built, units=units, asked=chamfer)
     facts = {
         **built.facts, "model": path.name, "sha256": file_sha256(path), "scene": loaded.name,
-        "world_origin": list(loaded.origin),
+        "world_origin": list(loaded.origin), "world_coordinates": world,
         "rasterizers": dict(subject.rasterizer.choices), **({"chamfer": scores} if scores else {}),
     }  # fmt: skip
     alone = target.suffix.lower() == MESH and not target.is_dir()
     if alone:
-        write_mesh(built.post, target)
-    files = [target.name] if alone else write_files(target, built, loaded, facts, culled)
+        write_mesh(built.post, target, loaded.origin if world else None)
+    files = [target.name] if alone else write_files(target, built, loaded, facts, culled, world=world)
     if as_json:
         print_json({**facts, "folder": str(target.parent if alone else target), "files": files})
         return
@@ -146,8 +149,9 @@ def mesh(
         f"mesh: {len(built.post.vertices):,} vertices, {len(built.post):,} triangles, "
         f"voxel {parameters.voxel_size:.4g}, {built.facts['seconds']:.1f} s: {target if alone else target / POST}"
     )
-    if any(loaded.origin):
-        click.echo(f"its coordinates are those about the scene's local origin, which lies at {loaded.origin}")
+    if any(loaded.origin) and not world:
+        about = f"its coordinates are those about the scene's local origin, which lies at {loaded.origin}"
+        click.echo(f"{about} (--world adds it)")
     for name, value in scores.items():
         click.echo(f"{name}: {value:.4g}" if isinstance(value, float) else f"{name}: {value}")
 

@@ -17,17 +17,20 @@ RAW, POST, CULLED, PICTURE, FACTS = "mesh.ply", "mesh_post.ply", "mesh_culled.pl
 
 
 def write_files(
-    folder: Path, built: Built, scene: Scene, facts: Mapping[str, Any], culled: Mesh | None = None
-) -> list[str]:
+    folder: Path, built: Built, scene: Scene, facts: Mapping[str, Any], culled: Mesh | None = None, *,
+    world: bool = False,
+) -> list[str]:  # fmt: skip
     """Write meshes, a picture and facts of a mesh; returns the names of the files.
 
     culled  what culling by masks left, in millimetres; None: there is none
+    world   mesh.ply and mesh_post.ply have coordinates of the world, not about the scene's local origin
     """
     folder.mkdir(parents=True, exist_ok=True)
     for name in (FACTS, CULLED):
         (folder / name).unlink(missing_ok=True)
-    write_mesh(built.raw, folder / RAW)
-    write_mesh(built.post, folder / POST)
+    origin = scene.origin if world else None
+    write_mesh(built.raw, folder / RAW, origin)
+    write_mesh(built.post, folder / POST, origin)
     if culled is not None:
         write_mesh(culled, folder / CULLED)
     save_pictures(built.post, [view.camera for view in scene.train], folder / PICTURE)

@@ -17,10 +17,13 @@ TYPES = {
 LONGEST_HEADER = 65_536
 
 
-def write_mesh(mesh: Mesh, path: Path) -> None:
-    """Write a mesh, atomically: float32 x y z, nx ny nz and uchar red green blue where it has them, int32 indices."""
-    fields: list[tuple[str, str]] = [(name, "<f4") for name in "xyz"]
-    columns = [mesh.vertices]
+def write_mesh(mesh: Mesh, path: Path, origin: tuple[float, float, float] | None = None) -> None:
+    """Write a mesh, atomically: float32 x y z, nx ny nz and uchar red green blue where it has them, int32 indices.
+
+    origin  added to the vertices, which then are doubles; None: they stay as they are
+    """
+    fields: list[tuple[str, str]] = [(name, "<f4" if origin is None else "<f8") for name in "xyz"]
+    columns = [mesh.vertices if origin is None else mesh.vertices + origin]
     if mesh.normals is not None:
         fields += [(name, "<f4") for name in ("nx", "ny", "nz")]
         columns.append(mesh.normals)
@@ -32,8 +35,10 @@ def write_mesh(mesh: Mesh, path: Path) -> None:
         vertices[name] = column
     faces = np.empty(len(mesh), dtype=[("count", "u1"), ("rows", "<i4", 3)])
     faces["count"], faces["rows"] = 3, mesh.triangles
-    kinds = {"<f4": "float", "u1": "uchar"}
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
+    kinds = {"<f4": "float", "<f8": "double", "u1": "uchar"}
+    header = ["ply", "format binary_little_endian 1.0"]
+    header += [] if origin is None else ["comment world_coordinates " + " ".join(map(repr, origin))]
+    header += [f"element vertex {len(vertices)}"]
     header += [f"property {kinds[kind]} {name}" for name, kind in fields]
     header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
     content = "\n".join(header).encode() + vertices.tobytes() + faces.tobytes()

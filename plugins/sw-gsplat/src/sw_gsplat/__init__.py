@@ -1,3 +1,3 @@
 """The public gsplat rasterizer behind Splatwizard's protocol."""
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"

@@ -1,3 +1,3 @@
 """HAC++: compression of anchors with a hash grid and an intra-anchor context, as a method of Splatwizard."""
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"

@@ -1,3 +1,3 @@
 """HAC: hash-grid assisted context for 3D Gaussian Splatting compression, as a method of Splatwizard."""
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"

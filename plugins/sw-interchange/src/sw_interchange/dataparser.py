@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from splatwizard_core.api import BitstreamError, SceneError, UserInputError
+from splatwizard_native import json_reason
 from sw_interchange.frames import transformed
 from sw_interchange.scene import GaussianScene
 
@@ -34,7 +35,7 @@ def undone(scene: GaussianScene, path: str | os.PathLike[str]) -> GaussianScene:
     except OSError as error:
         raise SceneError(f"{path}: cannot be read: {error.strerror}", path=str(path)) from error
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
-        raise BitstreamError(f"{name}: no map of nerfstudio: {type(error).__name__}: {error}") from error
+        raise BitstreamError(f"{name}: no map of nerfstudio: {type(error).__name__}: {json_reason(error)}") from error
     if matrix.shape != (3, 4) or not np.isfinite(matrix).all() or not 1e-12 < scale < 1e12:
         raise BitstreamError(f"{name}: no map of nerfstudio: a 3x4 transform and a scale above 0")
     rotation, offset = matrix[:, :3], matrix[:, 3]

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatwizard_core.api import BitstreamError, UserInputError
+from splatwizard_native import json_reason
 from sw_interchange.bands import COEFFICIENTS, Array
 from sw_interchange.frames import transformed
 from sw_interchange.gltf_writer import EXTENSION
@@ -49,7 +50,7 @@ class _Document:
         try:
             self.root = json.loads(bytes(data[20 : 20 + size]), parse_constant=_refuse)
         except (ValueError, RecursionError) as error:
-            raise self.error(f"damaged JSON: {error}") from error
+            raise self.error(f"damaged JSON: {json_reason(error)}") from error
         at = 20 + size
         self.blob = memoryview(b"")
         if at + 8 <= length:

@@ -1,4 +1,4 @@
-"""Registers importers and exporters of the formats that other programs use."""
+"""Registers importers, exporters, methods and codecs of the formats that other programs use."""
 
 from splatwizard_core.api import Registry, hookimpl
 
@@ -40,3 +40,30 @@ def register_importers(registry: Registry) -> None:
     for suffix in ("pt", "ckpt", "pth"):
         registry.add(f"checkpoint-{suffix}", "sw_interchange.registered:import_checkpoint", suffix=f".{suffix}",
                      summary="checkpoints of gsplat (.pt), nerfstudio (.ckpt) and 3DGS (.pth)")  # fmt: skip
+
+
+@hookimpl
+def register_methods(registry: Registry) -> None:
+    registry.add("spz", "sw_interchange.methods:Spz", title="SPZ",
+                 summary="a trained 3DGS scene as .spz (Niantic)",
+                 presets=["paper", "quick"], rates=["r1", "r2", "r3"])  # fmt: skip
+    registry.add("sog", "sw_interchange.methods:Sog", title="SOG",
+                 summary="a trained 3DGS scene as .sog (PlayCanvas)",
+                 presets=["paper", "quick"], rates=["r1", "r2", "r3"])  # fmt: skip
+    registry.add("splat", "sw_interchange.methods:Splat", summary="a trained 3DGS scene as .splat (antimatter15)",
+                 presets=["paper", "quick"], rates=["r1"])  # fmt: skip
+    registry.add("compressed-ply", "sw_interchange.methods:CompressedPly", title="compressed PLY",
+                 summary="a trained 3DGS scene as compressed .ply (PlayCanvas)",
+                 presets=["paper", "quick"], rates=["r1"])  # fmt: skip
+
+
+@hookimpl
+def register_coders(registry: Registry) -> None:
+    registry.add("spz", "sw_interchange.codecs:SpzCodec", codes="gaussians",
+                 summary="the bytes of a .spz: quantised, gzip or zstd")  # fmt: skip
+    registry.add("sog", "sw_interchange.codecs:SogCodec", codes="gaussians",
+                 summary="the bytes of a .sog: codebooks and a palette, WebP")  # fmt: skip
+    registry.add("splat", "sw_interchange.codecs:SplatCodec", codes="gaussians",
+                 summary="the bytes of a .splat: 32 a Gaussian, no SH")  # fmt: skip
+    registry.add("compressed-ply", "sw_interchange.codecs:CompressedPlyCodec", codes="gaussians",
+                 summary="the bytes of a compressed .ply: quantised in chunks of 256")  # fmt: skip

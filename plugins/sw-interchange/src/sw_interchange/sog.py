@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatwizard_core.api import BitstreamError
+from splatwizard_native import json_reason
 from sw_interchange.archive import read_archive
 from sw_interchange.bands import Array
 from sw_interchange.known_formats import MAX_META
@@ -87,7 +88,7 @@ class _Bundle:
         try:
             found = json.loads(text, parse_constant=refuse)
         except (ValueError, RecursionError) as error:
-            raise BitstreamError(f"{self.name}: a damaged meta.json: {error}") from error
+            raise BitstreamError(f"{self.name}: a damaged meta.json: {json_reason(error)}") from error
         if not isinstance(found, dict):
             raise BitstreamError(f"{self.name}: its meta.json is no description of a scene")
         if "lodLevels" in found:

@@ -1,3 +1,3 @@
 """Tools for authors of Splatwizard packages: a package to start from, and the checks that hold it to the contracts."""
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"

@@ -1,3 +1,3 @@
 """LightGaussian: prune by global significance, distil into fewer SH bands, vector-quantise what matters least."""
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"

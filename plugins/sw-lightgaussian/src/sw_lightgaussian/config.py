@@ -4,10 +4,10 @@ from collections.abc import Mapping
 from typing import ClassVar, Literal
 
 from pydantic import Field
-from sw_finetuning.distillation import DistillLoss
-from sw_finetuning.fine_tuning import FineTuningRates
-from sw_finetuning.pruning import CountRule
 from sw_gaussians.choices import Choosing, CodecChoice, Moved, PrunerChoice
+from sw_gaussians.finetune.distillation import DistillLoss
+from sw_gaussians.finetune.fine_tuning import FineTuningRates
+from sw_gaussians.finetune.pruning import CountRule
 
 from splatwizard_core.api import Params
 from sw_lightgaussian.importance_vq import VQSettings

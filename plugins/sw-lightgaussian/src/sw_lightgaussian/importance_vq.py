@@ -5,11 +5,14 @@ Source: LightGaussian (arXiv 2311.17245), section on vector quantisation.
 Parts (docs/bitstream.md):
 
     header      u8 version, u8 form of the indices (0 packed bits, 1 range coded), u32 vectors n, u32 entries K of the
-                codebook, u32 own vectors k
+                codebook, u32 own vectors k; of version 2, which names parts of others: names in UTF-8 of the entropy
+                model of the indices and of the array coder, a zero byte between them
     mask        a bit a vector, 1 where it keeps its own; `packed-bits`, these through `byte-planes`
     indices     of the other vectors, in order: `packed-bits`, or `categorical` where that is shorter
     codebook    float16 [K, d], `byte-planes`
     own         float16 [k, d], `byte-planes`
+
+Settings name another array coder than `byte-planes`, and an entropy model of integers that codes the indices (form 2).
 """
 
 from __future__ import annotations
@@ -19,20 +22,22 @@ import math
 import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from functools import partial
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import Field
 
-from splatwizard_core.api import BitstreamError, Params
+from splatwizard_core.api import BitstreamError
+from sw_codecs.models.exchangeable import NamedParts, codes_arrays, codes_matrices, decoded_matrix, hold_part
 
 if TYPE_CHECKING:
     from splatwizard_core.api import PluginManager
 
-VERSION = 1
-PACKED, RANGE_CODED = 0, 1
+VERSION, NAMED = 1, 2
+PACKED, RANGE_CODED, BY_NAME = 0, 1, 2
 HEADER = struct.Struct("<BBIII")
 HALF_MAX = 65504.0
 MAX_CODES = 1 << 16
@@ -40,8 +45,15 @@ MAX_CODES = 1 << 16
 Training = Literal["ema", "official", "kmeans"]
 
 
-class VQSettings(Params):
+class VQSettings(NamedParts):
     """Settings of `importance-vq`, and of the codec `vectree`."""
+
+    USUAL: ClassVar[dict[str, str]] = {"entropy": "", "arrays": "byte-planes"}
+
+    entropy: str = Field(
+        "", description="entropy model of the indices: any that codes integers; empty: `packed-bits` or `categorical`"
+    )
+    arrays: str = Field("byte-planes", description="coder of arrays of float16 and bytes: any that codes those")
 
     ratio: float = Field(0.6, ge=0, le=1, description="share of the vectors that share a codebook, the least important")
     size: int = Field(8192, ge=2, le=1 << 16, description="codebook entries at most")
@@ -92,6 +104,7 @@ class ImportanceVQ:
     iterations      updates of the codebook while it is trained
     training        by the quantizer `vq`: "ema" or "official" (the authors' rule), weighted batches of `batch` rows
                     with `decay` and up to `reseed` entries that start afresh each time; "kmeans", passes over all rows
+    entropy, arrays names of parts, as in `VQSettings`. Raises ConfigError for one that cannot serve
     device          where it is trained: "cpu", where equal arguments give equal bytes, or "cuda"
     """
 
@@ -109,6 +122,8 @@ class ImportanceVQ:
         decay: float = 0.8,
         reseed: int = 10,
         training: Training = "ema",
+        entropy: str = "",
+        arrays: str = "byte-planes",
         device: torch.device | str = "cpu",
     ) -> None:
         if not 0 <= ratio <= 1 or not 1 <= size <= MAX_CODES:
@@ -116,6 +131,12 @@ class ImportanceVQ:
         self.plugins, self.ratio, self.size, self.rows_per_code = plugins, ratio, size, rows_per_code
         self.iterations, self.batch, self.decay, self.reseed = iterations, batch, decay, reseed
         self.training, self.device = training, device
+        self.entropy, self.arrays = entropy, arrays
+        if entropy:
+            hold_part(plugins.entropy_models, entropy, "codec.settings.entropy", codes_matrices)
+        if arrays != "byte-planes":
+            tried = partial(codes_arrays, dtypes=(np.float16, np.uint8))
+            hold_part(plugins.array_coders, arrays, "codec.settings.arrays", tried)
 
     def encode(self, vectors: NDArray[Any], importance: NDArray[Any], seed: int = 0) -> dict[str, bytes]:
         """The parts for `vectors` [n, d], clamped to the range of float16; equal arguments give equal bytes.
@@ -179,16 +200,21 @@ class ImportanceVQ:
     def pack(self, coded: CodedVectors) -> dict[str, bytes]:
         """The parts; the inverse of `unpack`, byte for byte."""
         load = self.plugins.coders.load
-        planes, packed = load("byte-planes")(), load("packed-bits")
+        planes, packed = load(self.arrays)(), load("packed-bits")
         keeps = coded.codes < 0
         codes, size = coded.codes[~keeps], len(coded.codebook)
-        form, indices = PACKED, packed(max(size, 1)).encode(codes)
-        ranged = self._range(size, len(codes))
-        if len(codes) and len(shorter := ranged[0].encode(codes.astype(np.int32), ranged[1])) < len(indices):
-            form, indices = RANGE_CODED, shorter
+        if self.entropy:
+            form, indices = BY_NAME, self.plugins.entropy_models.load(self.entropy)().encode(codes, None)
+        else:
+            form, indices = PACKED, packed(max(size, 1)).encode(codes)
+            ranged = self._range(size, len(codes))
+            if len(codes) and len(shorter := ranged[0].encode(codes.astype(np.int32), ranged[1])) < len(indices):
+                form, indices = RANGE_CODED, shorter
+        named = bool(self.entropy) or self.arrays != "byte-planes"
+        names = f"{self.entropy}\0{self.arrays}".encode() if named else b""
         mask = np.frombuffer(packed(2).encode(keeps.astype(np.uint8)), np.uint8)
         return {
-            "header": HEADER.pack(VERSION, form, len(coded.codes), size, len(coded.own)),
+            "header": HEADER.pack(NAMED if named else VERSION, form, len(coded.codes), size, len(coded.own)) + names,
             "mask": planes.encode(mask),
             "indices": indices,
             "codebook": planes.encode(coded.codebook),
@@ -198,9 +224,13 @@ class ImportanceVQ:
     def unpack(self, parts: Mapping[str, bytes], n: int, d: int) -> CodedVectors:
         """Read the parts and check what they hold. Raises PartError, a BitstreamError."""
         with _part(parts, "header") as data:
-            form, size, own = _header(data, n)
+            form, size, own, entropy, arrays = _header(data, n)
+            known = {"entropy model": self.plugins.entropy_models.names, "array coder": self.plugins.array_coders.names}
+            for kind, name in (("entropy model", entropy), ("array coder", arrays)):
+                if name and name not in known[kind]:
+                    raise BitstreamError(f"the {kind} {name!r:.80} is not installed")
         load = self.plugins.coders.load
-        planes, packed = load("byte-planes")(), load("packed-bits")
+        planes, packed = load(arrays)(), load("packed-bits")
         with _part(parts, "mask") as data:
             mask = planes.decode(data, np.uint8, ((n + 7) // 8,))
             keeps = packed(2).decode(mask.tobytes(), np.uint8, (n,)).astype(bool)
@@ -210,6 +240,8 @@ class ImportanceVQ:
         with _part(parts, "indices") as data:
             if form == PACKED:
                 found = packed(max(size, 1)).decode(data, np.int64, (n - own,))
+            elif form == BY_NAME:
+                found = decoded_matrix(self.plugins.entropy_models.load(entropy)(), data, n - own)
             else:
                 model, context = self._range(size, n - own)
                 found = model.decode(data, context)
@@ -230,19 +262,22 @@ class ImportanceVQ:
         return model(), model.Context(max(size, 1), n)
 
 
-def _header(data: bytes, n: int) -> tuple[int, int, int]:
-    """Form of the indices, entries of the codebook, own vectors."""
-    if len(data) != HEADER.size:
+def _header(data: bytes, n: int) -> tuple[int, int, int, str, str]:
+    """Form of the indices, entries of the codebook, own vectors, names of the entropy model and the array coder."""
+    names = data[HEADER.size :].decode().split("\0")
+    if len(data) < HEADER.size or len(names) != (2 if data[0] == NAMED else 1) or (data[0] == VERSION and names[0]):
         raise BitstreamError(f"{len(data)} bytes, must be {HEADER.size}")
-    version, form, stated, size, own = HEADER.unpack(data)
-    if version != VERSION or form not in (PACKED, RANGE_CODED):
+    version, form, stated, size, own = HEADER.unpack(data[: HEADER.size])
+    entropy, arrays = names if version == NAMED else ("", "byte-planes")
+    forms = {VERSION: (PACKED, RANGE_CODED), NAMED: (BY_NAME,) if entropy else (PACKED, RANGE_CODED)}
+    if form not in forms.get(version, ()) or not arrays:
         raise BitstreamError(f"vectors of version {version}, form {form} are not known: upgrade sw-lightgaussian")
     if stated != n:
         raise BitstreamError(f"there are {stated:,} vectors, expected {n:,}")
     coded = n - own
     if coded < 0 or size > min(coded, MAX_CODES) or (coded > 0 and size == 0):
         raise BitstreamError(f"{size:,} codebook entries and {own:,} own vectors cannot be of {n:,} vectors")
-    return form, size, own
+    return form, size, own, entropy, arrays
 
 
 @contextlib.contextmanager

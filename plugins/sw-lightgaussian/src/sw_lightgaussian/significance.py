@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 
 import torch
 from pydantic import Field
-from sw_finetuning.volume import VolumeNorm, volume_factor
+from sw_gaussians.finetune.volume import VolumeNorm, volume_factor
 
 from splatwizard_core.api import GaussianModel, Params, RasterOptions, ScoreSpec
 

@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from sw_finetuning.volume import volume_factor
+from sw_gaussians.finetune.volume import volume_factor
 from sw_gaussians.surfels import refuse_surfels
 from torch import Tensor
 
 from splatwizard_core.api import BitstreamError, GaussianModel, SplatwizardError
+from sw_codecs.models.exchangeable import array_coder
 from sw_codecs.positions.ordering import box_cells
 from sw_lightgaussian.importance_vq import HALF_MAX, CodedVectors, ImportanceVQ, PartError, VQSettings
 
@@ -91,18 +92,18 @@ class VecTree:
         degree = reader.integer("max_sh_degree", low=0, high=3)
         active = reader.integer("active_sh_degree", low=0, high=degree)
         reader.allow(_decoded_bytes(n, degree), f"a model of {n:,} Gaussians")
-        load = self.plugins.coders.load
+        planes = array_coder(reader, self.plugins, "arrays", "byte-planes")
         with reader.decoding("xyz") as data:
-            means = _finite(load("float-delta")().decode(data, np.float32, (n, 3)))
+            means = _finite(self.plugins.coders.load("float-delta")().decode(data, np.float32, (n, 3)))
         with reader.decoding("attr") as data:
-            attributes = _finite(load("byte-planes")().decode(data, np.float16, (n, ATTRIBUTES))).astype(np.float32)
+            attributes = _finite(planes.decode(data, np.float16, (n, ATTRIBUTES))).astype(np.float32)
         bands = (degree + 1) ** 2
         coded = self._coded(reader, n, 3 * bands)
         colors = coded.vectors()
         dc, rest = colors[:, None, :3], colors[:, 3:].reshape(n, 3, bands - 1).transpose(0, 2, 1)
         tensors = (means, dc, rest, attributes[:, 0], attributes[:, 1:4], attributes[:, 4:])
         return CodedGaussians(
-            *(torch.from_numpy(np.ascontiguousarray(t)) for t in tensors),
+            *(torch.from_numpy(np.require(t, requirements=["C", "W"])) for t in tensors),
             active_sh_degree=active,
             code=torch.from_numpy(coded.codes.astype(np.int32)),
             codebook=torch.from_numpy(coded.codebook.astype(np.float32)),
@@ -135,6 +136,8 @@ class VecTree:
         writer.static["num_gaussians"] = model.num_rows
         writer.static["max_sh_degree"] = model.max_sh_degree
         writer.static["active_sh_degree"] = model.active_sh_degree
+        if self.vq.arrays != "byte-planes":
+            writer.static["arrays"] = self.vq.arrays
         load = self.plugins.coders.load
         writer.add("xyz", load("float-delta")().encode(arrays["means"][order]))
         parts = self.vq.pack(coded)
@@ -142,7 +145,7 @@ class VecTree:
             writer.add(section, parts[part])
         attributes = np.concatenate([arrays["opacity_logits"][:, None], arrays["log_scales"], arrays["quats"]], 1)
         halves = np.clip(attributes, -HALF_MAX, HALF_MAX).astype(np.float16)
-        writer.add("attr", load("byte-planes")().encode(halves[order]))
+        writer.add("attr", load(self.vq.arrays)().encode(halves[order]))
         n = model.num_rows
         writer.allow(_decoded_bytes(n, model.max_sh_degree), f"a model of {n:,} Gaussians")
 

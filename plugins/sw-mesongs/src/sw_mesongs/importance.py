@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import torch
 from pydantic import Field
-from sw_finetuning.volume import volume_factor
+from sw_gaussians.finetune.volume import volume_factor
 
 from splatwizard_core.api import GaussianModel, Params, RasterOptions, ScoreSpec
 

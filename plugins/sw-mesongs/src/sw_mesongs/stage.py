@@ -6,7 +6,7 @@ import logging
 from typing import TYPE_CHECKING
 
 import torch
-from sw_finetuning.pruning import scores_of, up_to
+from sw_gaussians.finetune.pruning import scores_of, up_to
 
 from splatwizard_core.api import (
     CameraIterator,

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 from pydantic import Field, model_validator
-from sw_finetuning.fine_tuning import FineTuningRates
-from sw_finetuning.pruning import CountRule
 from sw_gaussians.choices import Choosing, CodecChoice, Moved, PrunerChoice
+from sw_gaussians.finetune.fine_tuning import FineTuningRates
+from sw_gaussians.finetune.pruning import CountRule
 
 
 class Prune(PrunerChoice):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sw_finetuning.fine_tuning import FineTuningStage, collect_anew, windows_before
-from sw_finetuning.pruning import PruneByScore
+from sw_gaussians.finetune.fine_tuning import FineTuningStage, collect_anew, windows_before
+from sw_gaussians.finetune.pruning import PruneByScore
 
 from splatwizard_core.api import ConfigError, SplatOptimizer
 

@@ -1,3 +1,3 @@
 """Compiled rasterizers for Splatwizard: one C++ and CUDA kernel family, its mathematics shared."""
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"

@@ -31,12 +31,12 @@ GENERATED, SIZE = 12, (512, 512)
 
 
 @click.command(short_help="two files; a run beside published figures")
-@click.argument("paths", metavar="A B | RUN...", nargs=-1, required=True, type=click.Path())
+@click.argument("paths", metavar="A B | RUN...", nargs=-1, required=True, type=EXISTING)
 @options(
     scene_option, images_option, set_option,
     click.option(
         "--cameras", type=EXISTING, metavar="FILE",
-        help="JSON of the cameras to draw from (README of sw-render).  [default: the scene's test views; without a "
+        help="JSON of the cameras to draw from (README of sw-view).  [default: the scene's test views; without a "
         "scene 12 cameras around the Gaussians]",
     ),
     click.option("--published", is_flag=True, help="Compare runs with published figures of their data set and scene."),
@@ -45,7 +45,7 @@ GENERATED, SIZE = 12, (512, 512)
 )  # fmt: skip
 @takes_choices
 def compare(
-    paths: tuple[str, ...], cameras: Path | None, published: bool, own: bool, as_json: bool, chosen: Choices
+    paths: tuple[Path, ...], cameras: Path | None, published: bool, own: bool, as_json: bool, chosen: Choices
 ) -> None:
     """Compare two files of any format or method, or run directories: bytes, attributes, and what they show.
 
@@ -65,15 +65,15 @@ def compare(
         raise click.UsageError("give two files (or run directories) A and B, or --published with any number of runs")
     if own:
         raise click.UsageError("--own is for --published")
-    print_facts(_compared(Path(paths[0]), Path(paths[1]), cameras, chosen), as_json, _tell)
+    print_facts(_compared(paths[0], paths[1], cameras, chosen), as_json, _tell)
 
 
-def _beside_published(folders: tuple[str, ...], own: bool, as_json: bool) -> None:
+def _beside_published(folders: tuple[Path, ...], own: bool, as_json: bool) -> None:
     from sw_report.beside_tables import beside_tables, to_dict
     from sw_report.printed import print_tables
     from sw_report.runs import collect
 
-    collection = collect([Path(folder) for folder in folders])
+    collection = collect(folders)
     tables = beside_tables(collection.runs, others=not own)
 
     def told(facts: dict[str, Any]) -> None:
@@ -88,9 +88,6 @@ def _compared(a: Path, b: Path, camera_file: Path | None, chosen: Choices) -> di
     from sw_report.attribute_errors import attribute_errors
     from sw_report.compared_models import compare_pictures, open_file
 
-    for path in (a, b):
-        if not path.exists():
-            raise UserInputError(f"{path}: there is no such file or folder")
     configs = [path / "config.toml" for path in (a, b) if (path / "config.toml").is_file()]
     of_runs = [replace(chosen, config_file=str(config)).resolve_without_method() for config in configs]
     scenes = sorted({each.absolute_scene for each in of_runs})

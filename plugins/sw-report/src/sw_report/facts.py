@@ -15,6 +15,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from splatwizard_core.api import UserInputError
 from splatwizard_core.tooling import SCHEMA
+from splatwizard_native import json_reason
 from sw_report import numbers
 from sw_report.declared import metric_style, uncompressed
 
@@ -261,7 +262,7 @@ def read_facts(path: Path) -> tuple[RunFacts, list[str]]:
     except OSError as error:
         raise UserInputError(f"{path}: cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
-        raise UserInputError(f"{path}: not a result record: {error}") from None
+        raise UserInputError(f"{path}: not a result record: {json_reason(error)}") from None
     notes: list[str] = []
     version = content.get("schema_version")
     if version != SCHEMA:

@@ -115,7 +115,7 @@ def render_page(collection: Collection, options: PageOptions, folder: Path | Non
 
 
 def scene_links(runs: Sequence[Run], folder: Path) -> list[tuple[str, str]]:
-    """Return (address relative to `folder`, name) of the pages in 3D that sw-viewer left beside the records."""
+    """Return (address relative to `folder`, name) of the pages in 3D that sw-view left beside the records."""
     found = []
     for run in runs:
         page = run.directory / SCENE_PAGE

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
@@ -17,6 +18,13 @@ KNOWN = (*PAPER, "scenes", "seeds", "primitives", "steps", "train", "encode", "d
 """Columns that are no metrics, besides the usual metrics; any metric is one by its name."""
 
 
+ALIASES = {
+    "bytes": "size", "mb": "size", "gaussians": "primitives", "anchors": "primitives", "iterations": "steps",
+    "seconds": "train", "time": "train",
+}  # fmt: skip
+"""Other words for columns, as heads and records have them."""
+
+
 def chosen_columns(words: str | None, tables: Sequence[Table], *, default: Sequence[str] | None) -> list[str] | None:
     """Return the keys that `--columns` names: "all" is None, "paper" that set, None the default.
 
@@ -27,13 +35,15 @@ def chosen_columns(words: str | None, tables: Sequence[Table], *, default: Seque
     names = [word.strip().lower() for word in words.split(",") if word.strip()]
     if names == ["all"]:
         return None
-    names = [name for word in names for name in (PAPER if word == "paper" else (word,))]
+    names = [name for word in names for name in (PAPER if word == "paper" else (ALIASES.get(word, word),))]
     there = {column.key.lower() for table in tables for column in table.columns if column.key}
     wrong = [name for name in names if name not in there and name not in KNOWN]
     if wrong or not names:
+        known = list(dict.fromkeys([*sorted(there), LPIPS, "all", "paper"]))
+        near = difflib.get_close_matches(wrong[0], [*known, *ALIASES], 1) if wrong else []
+        hint = f"did you mean '{near[0]}'? It knows" if near else "one or more of"
         told = f"has no '{wrong[0]}'" if wrong else "is empty"
-        known = ", ".join(dict.fromkeys([*sorted(there), LPIPS, "all", "paper"]))
-        raise click.UsageError(f"--columns {told}: one or more of {known}")
+        raise click.UsageError(f"--columns {told}: {hint} {', '.join(known)}")
     return names
 
 

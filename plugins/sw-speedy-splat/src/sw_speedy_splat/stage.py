@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sw_finetuning.pruning import PruneByScore
 from sw_gaussians.fast_tasks import DensifyToBudget, HalveOpacity
+from sw_gaussians.finetune.pruning import PruneByScore
 from sw_gaussians.statistics import collect_statistics
 from sw_gaussians.tasks import PruneAndDensify, ResetOpacity
 from sw_gaussians.wrapped_stage import WrappedStage

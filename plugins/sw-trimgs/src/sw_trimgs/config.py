@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import ClassVar, Literal
 
 from pydantic import Field
-from sw_finetuning.fine_tuning import FineTuningRates
 from sw_gaussians.choices import Choosing, CodecChoice, PrunerChoice
 from sw_gaussians.config import GaussianTraining
+from sw_gaussians.finetune.fine_tuning import FineTuningRates
 
 from splatwizard_core.api import Params
 from sw_trimgs.scale_split import Box

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import torch
-from sw_finetuning.fine_tuning import FineTuningStage
+from sw_gaussians.finetune.fine_tuning import FineTuningStage
 from sw_gaussians.stage import ThreeDGSStage
 from sw_gaussians.statistics import collect_statistics
 from sw_gaussians.tasks import PruneAndDensify, ResetOpacity

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from sw_finetuning.pruning import scores_of
+from sw_gaussians.finetune.pruning import scores_of
 from torch import Tensor
 
 from splatwizard_core.api import (

@@ -1,3 +1,3 @@
 """Trimming the Fat: what is faint and hardly moves the pictures goes, in ten small steps (arXiv 2406.18214)."""
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"

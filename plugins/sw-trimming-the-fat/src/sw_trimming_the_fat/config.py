@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import ClassVar, Literal
 
 from pydantic import Field, model_validator
-from sw_finetuning.fine_tuning import FineTuningRates
 from sw_gaussians.choices import Choosing, CodecChoice, Moved, PrunerChoice
+from sw_gaussians.finetune.fine_tuning import FineTuningRates
 
 
 class Prune(PrunerChoice):

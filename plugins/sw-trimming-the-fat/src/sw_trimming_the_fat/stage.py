@@ -6,8 +6,8 @@ import logging
 import math
 from typing import TYPE_CHECKING
 
-from sw_finetuning.fine_tuning import FineTuningStage, collect_anew, windows_before
-from sw_finetuning.pruning import PruneByScore, scores_of
+from sw_gaussians.finetune.fine_tuning import FineTuningStage, collect_anew, windows_before
+from sw_gaussians.finetune.pruning import PruneByScore, scores_of
 from sw_gaussians.statistics import GRADIENT_STATISTICS, collect_statistics
 
 from splatwizard_core.api import (

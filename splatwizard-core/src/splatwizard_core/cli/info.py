@@ -26,7 +26,7 @@ def info(path: str, as_json: bool, chosen: Choices) -> None:
     served which phase), a .ply, or a scene (a folder, dataset/scene, or one that is made on the spot, by its name)."""
     if not path.strip():
         raise click.UsageError("PATH is empty")
-    where = Path(path)
+    where = existing(path) if Path(path).exists() else Path(path)
     if (where / "scene.swz").is_file() and (where / "config.toml").is_file():
         where = where / "scene.swz"
     show: Callable[[dict[str, Any]], None] = _print_plain

@@ -9,14 +9,16 @@ from pathlib import Path
 import click
 from click.shell_completion import CompletionItem
 
-from splatwizard_core.errors import UserInputError
+from splatwizard_core.errors import UserInputError, no_file
 
 
 def existing(path: str | Path, hint: str = "") -> Path:
-    """A path that must be there; `hint` ends the message of the error."""
+    """A file or folder that must be there; `hint` ends the message of the error."""
     found = Path(path)
     if not found.exists():
         raise UserInputError(f"{path}: there is no such file or folder{hint}")
+    if not found.is_file() and not found.is_dir():
+        raise UserInputError(f"{path}: {no_file(found)}")
     return found
 
 

@@ -82,8 +82,25 @@ class Choices:
             for method in map(plugins.methods.load, self.method_names(plugins))
             for rate in ([None] if self.rate is None else rate_points(method, self.rate))
         ]
-        found = _with_shared_starts(plugins, _without_unused_starts(plugins, found))
+        found = self._with_starts_alike(plugins, _without_unused_starts(plugins, found))
         return [checked_start(plugins, each) for each in found]
+
+    def _with_starts_alike(self, plugins: PluginManager, found: list[ResolvedConfig]) -> list[ResolvedConfig]:
+        """Let what --set and --config say also train the scenes that the methods start from.
+
+        Not the file of a run: it says all of it, in a table `pretrained` of its own.
+        """
+        from splatwizard_core.runs.config import is_whole
+        from splatwizard_core.runs.pretrained import for_starts
+
+        of_user = {"--set"}
+        if self.config_file and not is_whole(self.config_file):
+            of_user.add(self.config_file)
+        settled = []
+        for each in found:
+            given = [key for key, source in each.provenance.items() if source in of_user and key not in self.below]
+            settled.append(replace(each, pretrained={**for_starts(plugins, each, given), **each.pretrained}))
+        return settled
 
     def settled(
         self, found: list[ResolvedConfig], plugins: PluginManager, scene: Callable[[ResolvedConfig], Scene],
@@ -105,7 +122,8 @@ class Choices:
         for each in {each.method: each for each in found}.values():
             shared = [f"{k}={v}" for k, v in each.pretrained.items() if f"pretrained.{k}" not in each.provenance]
             if shared:
-                tell(f"{each.method}: the trained scene that it starts from has {', '.join(shared)} too")
+                told = f"{each.method}: the trained scene that it starts from has {', '.join(shared)} too"
+                tell(f"{told} (--set pretrained.KEY=VALUE decides)")
         return found
 
     def resolve_one(self, plugins: PluginManager) -> ResolvedConfig:
@@ -134,7 +152,9 @@ class Choices:
         for key, value in flatten(PipelineParams, tables).items():
             if key not in RESERVED and (key in SCENE_KEYS or field_at(PipelineParams, key) is not None):
                 from_file[key] = value
-        return resolve(NoMethod, "paper", sets={**from_file, **values}, scene=self.scene or tables.get("scene"))
+        found = resolve(NoMethod, "paper", sets={**from_file, **values}, scene=self.scene or tables.get("scene"))
+        sources = {key: str(file) for key in from_file if key not in values}
+        return replace(found, provenance={**found.provenance, **sources})
 
     def of_file(self, path: Path, tell: Callable[[str], None] = say) -> Choices:
         """The same for what looks at a file on a scene: where none is named, that of the file's run directory, as it
@@ -234,21 +254,6 @@ def _without_unused_starts(plugins: PluginManager, found: list[ResolvedConfig]) 
                 say(f"{method} does not start from a trained scene: '{what}' is for the others")
             found = [replace(each, **{what: nothing[what]}) if each.method in useless else each for each in found]
     return found
-
-
-def _with_shared_starts(plugins: PluginManager, found: list[ResolvedConfig]) -> list[ResolvedConfig]:
-    """Let what --set and --config say of several methods also train the scenes that some of them start from."""
-    from splatwizard_core.runs.pretrained import for_starts
-
-    if len({each.method for each in found}) < 2:
-        return found
-    settled = []
-    for each in found:
-        layers = ("preset ", "data set ", "rate ")
-        given = [key for key, source in each.provenance.items() if not source.startswith(layers)]
-        more = {key.removeprefix("pretrained."): value for key, value in for_starts(plugins, each, given).items()}
-        settled.append(replace(each, pretrained={**more, **each.pretrained}))
-    return settled
 
 
 def open_session(resolved: ResolvedConfig, plugins: PluginManager) -> Session:

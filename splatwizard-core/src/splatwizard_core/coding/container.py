@@ -33,7 +33,7 @@ import numpy.typing as npt
 from splatwizard_core.coding.array_section import pack_array, unpack_array
 from splatwizard_core.coding.limits import beyond_limit, decoded_limit
 from splatwizard_core.coding.requirements import Requirement, dump_requirements, parse_requirements
-from splatwizard_core.errors import BitstreamError, PluginError, SplatwizardError
+from splatwizard_core.errors import BitstreamError, PluginError, SplatwizardError, no_file
 from splatwizard_native import dump_strict, load_strict, write_atomic
 
 MAGIC = b"SPWZ"
@@ -171,7 +171,7 @@ class ContainerReader:
         reader = cls.__new__(cls)
         try:
             if not where.is_file():
-                raise BitstreamError(f"{where}: there is no such file")
+                raise BitstreamError(f"{where}: {no_file(where)}")
             with where.open("rb") as file:
                 reader._read(file, os.fstat(file.fileno()).st_size, where.name)
         except OSError as error:

@@ -79,9 +79,14 @@ def in_world(model: SplatModel, name: str) -> SplatModel:
     """The model, asked of the next exporter in the coordinates of the world: `origin` says `as_world`.
 
     One that can hold doubles adds the world's origin in double precision, others do in float32 (`world_shift`).
-    Raises UserInputError where the file does not say where its origin lies.
+    Raises UserInputError for what is no explicit Gaussians, and where the file does not say where its origin lies.
     """
-    if origin_of(model) is None or not isinstance(model, GaussianModel):
+    if not isinstance(model, GaussianModel):
+        raise UserInputError(
+            f"--world: {name} holds no explicit Gaussians (but {type(model).__name__}), whose Gaussians depend on the "
+            "camera; `sw bake FILE OUT --scene SCENE` fits explicit ones, which keep the origin of the scene"
+        )
+    if origin_of(model) is None:
         raise UserInputError(
             f"--world: {name} does not say where its origin lies: its scene was not moved, or another program wrote it"
         )

@@ -15,9 +15,9 @@ from email.parser import HeaderParser
 
 from packaging.requirements import InvalidRequirement, Requirement
 
-from splatwizard_core.plugins.catalogue import CORE, is_ours, normal_name, our_distributions
+from splatwizard_core.plugins.catalogue import CORE, is_ours, normal_name, our_distributions, superseded
 from splatwizard_core.plugins.guards import one_line
-from splatwizard_core.plugins.migration import CHANGED, PAGE, written_for
+from splatwizard_core.plugins.migration import KEPT, PAGE, changed_since, written_for
 
 log = logging.getLogger(__name__)
 
@@ -72,7 +72,7 @@ def installed_entry_points(group: str) -> list[importlib.metadata.EntryPoint]:
 
 
 def shadowed() -> list[str]:
-    """Return a line about each distribution of ours that lies on the path twice, or once more in a stranger's files."""
+    """Return a line about each distribution of ours that lies on the path twice, or is superseded and still there."""
     places: dict[str, dict[tuple[str, str], None]] = {}
     for folder in dict.fromkeys(sys.path):
         with contextlib.suppress(OSError):  # a zip file, a folder that is gone
@@ -85,6 +85,10 @@ def shadowed() -> list[str]:
         (first, used), *others = places[name]
         for folder, version in others:
             told.append(f"{name} {used} in {first} hides {name} {version} in {folder}: remove the wrong one")
+    for name in sorted(superseded().keys() & places.keys()):
+        now, (folder, version) = superseded()[name], next(iter(places[name]))
+        cure = f"uninstall it, then pip install --force-reinstall --no-deps {now}"
+        told.append(f"{name} {version} in {folder} is not used, it is part of {now} now: {cure}")
     return told
 
 
@@ -123,15 +127,19 @@ def unmet_requirement(dist: importlib.metadata.Distribution | None) -> str | Non
             return f"its metadata requires {text[:80]!r}, which cannot be read: have its author mend `dependencies`"
         if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
             continue
+        name = superseded().get(normal_name(requirement.name), requirement.name)
         try:
-            version = _installed_version(requirement.name)
+            version = _installed_version(name)
         except importlib.metadata.PackageNotFoundError:
-            return f"needs {requirement.name}, which is not installed: pip install {requirement.name}"
-        if not requirement.specifier.contains(version, prereleases=True):
+            part = "" if name == requirement.name else f"part of {name} now and "
+            return f"needs {requirement.name}, which is {part}not installed: pip install {name}"
+        # Our packages go on serving those that were written for the contract before this one.
+        kept = is_ours(name) and requirement.specifier.contains(KEPT)
+        if not (kept or requirement.specifier.contains(version, prereleases=True)):
             wanted = f"{requirement.name}{requirement.specifier}"
             if normal_name(requirement.name) == CORE and (contract := written_for([text])):
-                ways = f"pip install --upgrade {_header(dist)['Name']}"
-                return f"it is written for {CORE} {contract} ({wanted}), here is {version}: {CHANGED} ({PAGE}): {ways}"
+                since, ways = changed_since(contract), f"pip install --upgrade {_header(dist)['Name']}"
+                return f"it is written for {CORE} {contract} ({wanted}), here is {version}: {since} ({PAGE}): {ways}"
             return f"needs {wanted}, but {version} is installed: pip install '{wanted}'"
     return None
 

@@ -14,7 +14,7 @@ import pluggy
 
 from splatwizard_core.errors import PluginError
 from splatwizard_core.plugins import hookspecs, loading
-from splatwizard_core.plugins.catalogue import normal_name
+from splatwizard_core.plugins.catalogue import normal_name, superseded
 from splatwizard_core.plugins.guards import guarded_hooks, one_line, prints_to_stderr
 from splatwizard_core.plugins.loading import PluginInfo
 from splatwizard_core.plugins.migration import migration_hint
@@ -205,9 +205,13 @@ def _chosen(
 ) -> list[tuple[PluginInfo, importlib.metadata.EntryPoint]]:
     """The plugins to load: the core, ours, others by name. Raises PluginError for one in `only` that is not there."""
     found = [(loading.plugin_info(each), each) for each in entry_points]
+    found = [each for each in found if normal_name(each[0].distribution) not in superseded()]
     found.sort(key=lambda each: (not each[0].is_core, each[0].foreign, each[0].key, each[0].distribution))
     if only is None:
         return found
+    # One that became part of another package is that one, as a distribution or by the name of its entry point.
+    homes = {name: now for old, now in superseded().items() for name in (old, old.partition("-")[2])}
+    only = {homes.get(normal_name(name), name) for name in only}
     unknown = [name for name in sorted(only) if not any(normal_name(name) in loading.names_of(e) for _, e in found)]
     if unknown:
         raise PluginError(

@@ -18,8 +18,17 @@ from packaging.version import Version
 from splatwizard_core.errors import PluginError
 from splatwizard_core.plugins.catalogue import CORE, normal_name
 
-CHANGED = "names of the core come from splatwizard_core.api, the rest from packages of its own, and hooks have changed"
+KEPT = "0.2"
+"""The older contract that this release still serves: its import paths are forwarded."""
+CHANGED = {
+    "0.1": "names of the core come from splatwizard_core.api, the rest from packages of its own, and hooks have changed"
+}
 PAGE = "docs/migration.md"
+
+
+def changed_since(contract: str) -> str:
+    """Say what has changed since a release of the core, such as "0.1"."""
+    return CHANGED.get(contract, "packages were joined, and some modules have moved")
 
 
 def written_for(requires: Iterable[str]) -> str:
@@ -53,5 +62,5 @@ def migration_hint(distribution: str, error: BaseException) -> str:
     if not (contract or now):
         return ""
     core = f"{CORE} {contract}" if contract else f"an older {CORE}"
-    changed = f"{lacks[1]} is now {now}" if lacks and now else CHANGED
+    changed = f"{lacks[1]} is now {now}" if lacks and now else changed_since(contract or "0.1")
     return f"; it is written for {core}, here is {importlib.metadata.version(CORE)}: {changed} ({PAGE})"

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from packaging.requirements import Requirement
 
 from splatwizard_core.plugins import Entry, PluginManager
-from splatwizard_core.plugins.catalogue import CORE, is_ours, normal_name
+from splatwizard_core.plugins.catalogue import CORE, is_ours, normal_name, superseded
 
 
 def made_by(plugins: PluginManager, entries: Iterable[Entry]) -> dict[str, str]:
@@ -34,9 +34,14 @@ def changes(plugins: PluginManager, before: Mapping[str, str]) -> list[str]:
 
     A distribution that was not noted is no change.
     """
-    now = installed(plugins, before)
-    pairs = ((name, version, now[name]) for name, version in before.items())
-    return [f"{name} {was}, now {version or 'not installed'}" for name, was, version in pairs if version != was]
+    now = installed(plugins, [superseded().get(name, name) for name in before])
+    told = []
+    for name, was in before.items():
+        home = superseded().get(name, name)
+        if home != name or now[home] != was:
+            part = "" if home == name else f"part of {home} "
+            told.append(f"{name} {was}, now {f'{part}{now[home]}' if now[home] else 'not installed'}")
+    return told
 
 
 @functools.cache

@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 from splatwizard_core.errors import ConfigError, PluginError
 from splatwizard_core.evaluation.metrics import MetricSettings, check_settings
@@ -82,6 +82,11 @@ class ResolvedConfig:
         is_path = not self.procedural and Path(self.scene_spec).exists()
         return str(Path(self.scene_spec).resolve()) if is_path else self.scene_spec
 
+    def is_of_run(self, key: str) -> bool:
+        """Whether a key has its value from the config.toml of a run."""
+        source = self.provenance.get(key, "")
+        return source.endswith(".toml") and os.path.isfile(source) and is_whole(source)
+
     def as_dict(self) -> dict[str, Any]:
         """Return plain values by block, None included, as the record keeps them."""
         return {
@@ -135,8 +140,14 @@ class ResolvedConfig:
         return self._beside_config(all_values, self._by_content(values))
 
     def _beside_config(self, values: Callable[[Params], dict[str, Any]], config: dict[str, Any]) -> dict[str, Any]:
-        reading = SceneParams(**self.scene_options)
-        return {"method": self.method, "config": config, "pipeline": values(self.ppl), "scene": values(reading)}
+        return {"method": self.method, "config": config, "pipeline": values(self.ppl), "scene": values(self._reading)}
+
+    @functools.cached_property
+    def _reading(self) -> SceneParams:
+        """How the scene is read, with what a file of names holds in place of where it lies."""
+        split = self.scene.split
+        told = f"sha256 {file_sha256(Path(split))}" if _is_list(split) else split
+        return SceneParams(**{**self.scene_options, "split": told})
 
     def config_content(self) -> dict[str, Any]:
         """Return the given hyper-parameters, with what input files hold in place of where they lie."""
@@ -168,10 +179,15 @@ class ResolvedConfig:
         content = {
             "method": self.method, "preset": self.preset, "rate": self.rate, "config": self.given,
             "pipeline": self.ppl.model_dump(mode="json", exclude_defaults=True),
-            "scene": given_values(SceneParams(**self.scene_options)), **self._beside_blocks(self.init),
+            "scene": given_values(self._reading), **self._beside_blocks(self.init),
         }  # fmt: skip
         content.pop("metrics", None)
         return content_hash(content)
+
+
+def _is_list(split: str | None) -> TypeGuard[str]:
+    """Whether a split is a file of names; one that has the name of a rule is not meant."""
+    return split is not None and split not in ("all", "file") and os.path.isfile(split)
 
 
 def content_hash(content: Any) -> str:
@@ -225,6 +241,11 @@ def read_config_file(path: str | Path) -> dict[str, Any]:
         if not isinstance(value, str) or not value.strip():
             raise ConfigError(f"bad value {value!r} for '{name}' in {path}: expected a name", key=name)
     return tables
+
+
+def is_whole(path: str | Path) -> bool:
+    """Whether a file is the config.toml of a run, which says everything: it names method, preset, rate and scene."""
+    return set(RESERVED) <= set(read_config_file(path))
 
 
 def parse_set(assignments: Sequence[str]) -> dict[str, str]:
@@ -310,7 +331,7 @@ def resolve(
     config = config.completed(plugins, provenance)
     reading_values = reading.model_dump()
     split = os.path.expanduser(reading_values["split"] or "")
-    if split not in ("all", "file") and os.path.isfile(split):  # a file of such a name is not meant
+    if _is_list(split):
         reading_values["split"] = os.path.abspath(split)  # other processes have other folders
     scene_options = SceneOptions(**reading_values, seed=ppl.seed)
     return ResolvedConfig(

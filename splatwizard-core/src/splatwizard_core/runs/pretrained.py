@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from splatwizard_core.errors import ConfigError, SplatwizardError, UserInputError
+from splatwizard_core.errors import ConfigError, SplatwizardError, UserInputError, no_file
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.gaussians.sound import leave_out_senseless
 from splatwizard_core.method import Method
@@ -81,21 +81,28 @@ def useful_starts(plugins: PluginManager, resolved: ResolvedConfig) -> set[str]:
 
 
 def for_starts(plugins: PluginManager, resolved: ResolvedConfig, keys: Iterable[str]) -> dict[str, Any]:
-    """Map `pretrained.KEY` to the value of a key, for those that the trainings of all scenes that it starts from have.
+    """Map keys to their values, for those that the trainings of all scenes that it starts from have.
 
-    keys    of values that were given for several methods alike: then the scenes that some of these methods start from
-            are trained by them too, as the one that stands beside them in a table is
-    Without those that only encode, and those for which the configuration says `pretrained.KEY` itself.
+    keys    those that were given: the scenes that a method starts from are trained by them too, as the one that
+            stands beside it in a table is
+    Without those that only encode, those for which the configuration says `pretrained.KEY` itself, and no steps at
+    all: a scene to start from is trained.
     """
     method = make_method(plugins, resolved)
     first = first_scene(method) if resolved.init else None
     bases = [plugins.methods.load(name).Config for name in named_scenes(method) if name != first]
     return {
-        f"pretrained.{key}": value_at(resolved.config, key)
+        key: value_at(resolved.config, key)
         for key in keys
         if bases and key not in resolved.pretrained and field_at(type(resolved.config), key) is not None
         and all(field_at(b, key) is not None and key.partition(".")[0] not in b.ENCODING for b in bases)
+        and (key != "iterations" or value_at(resolved.config, key) > 0)
     }  # fmt: skip
+
+
+def own_start(resolved: ResolvedConfig) -> str:
+    """Return the file that a method with an input file `init` starts from; empty: none."""
+    return str(value_at(resolved.config, INIT)) if INIT in input_files(type(resolved.config)) else ""
 
 
 def checked_start(plugins: PluginManager, resolved: ResolvedConfig) -> ResolvedConfig:
@@ -129,8 +136,7 @@ def checked_start(plugins: PluginManager, resolved: ResolvedConfig) -> ResolvedC
             parsed |= {k: value_at(base.config, k) for k in parsed if field_at(type(base.config), k) is not None}
             checked_start(plugins, base)
         resolved = replace(resolved, pretrained=parsed)
-    own = str(value_at(resolved.config, INIT)) if INIT in input_files(type(resolved.config)) else ""
-    for path in filter(None, (resolved.init, own)):
+    for path in filter(None, (resolved.init, own_start(resolved))):
         stamp = os.stat(path).st_mtime_ns if os.path.exists(path) else 0
         _checked_once(path, stamp)  # a command with many rate points asks as often
     return resolved
@@ -149,7 +155,7 @@ def check_model(path: str) -> GaussianModel:
         hint = f"name the .ply in it, such as {inside[-1]}" if inside else "it has to be the .ply of a trained scene"
         raise UserInputError(f"init: {path} is a folder: {hint}")
     if not where.is_file():
-        raise UserInputError(f"init: {path}: there is no such file")
+        raise UserInputError(f"init: {path}: {no_file(where)}")
     with open(where, "rb") as file:
         if file.read(4) == b"SPWZ":
             raise UserInputError(f"init: {path} is an encoded file: `sw export {path} FILE.ply` makes a .ply of it")

@@ -58,7 +58,8 @@ class Session:
         return found
 
     def scene(self, resolved: ResolvedConfig) -> Scene:
-        """Return the scene of a run, loaded once; its warnings are told once."""
+        """Return the scene of a run, loaded once; its warnings are told once, those about values that stand in the
+        config.toml of a run when it was made."""
 
         def load() -> Scene:
             if not resolved.scene_spec:
@@ -68,7 +69,8 @@ class Session:
             for warning in scene.warnings:
                 line = f"scene {scene.name}: {warning}"
                 self.told.append(line)
-                self.say(line)
+                if not resolved.is_of_run(warning.partition(" ")[0]):
+                    self.say(line)
             return scene
 
         return self.once(("scene", resolved.scene_spec, resolved.scene), load)

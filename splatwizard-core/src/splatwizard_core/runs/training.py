@@ -71,7 +71,9 @@ def _trained_in(home: Path, session: Session, request: RunRequest, key: str, sto
     steps, done = StepLog(home), _finished(session, home, key)
     if done is None:
         scene = session.scene(resolved)
-        session.say(f"training {resolved.method} on {scene.name} ({resolved.preset} preset, {session.device})")
+        own = pretrained.own_start(resolved)
+        start = f", from {own} in place of the scene's points" if own else ""
+        session.say(f"training {resolved.method} on {scene.name} ({resolved.preset} preset, {session.device}){start}")
         if not CheckpointStore(home / CHECKPOINTS).paths():  # those of another training are refused, and stay as is
             steps.finish(BEGUN, key, {})  # whoever wants the same scene meanwhile may wait for it
     request = replace(request, resume=request.resume or done is not None)
@@ -240,7 +242,7 @@ def _train_stages(
             directory=directory / CHECKPOINTS, identity=identity, trained=frozen, stop_after=stop_after,
             resume=request.resume, allow_changed_plan=request.allow_changed_plan, on_step=after_step,
             read_identity=lambda stored: stored_beside(plugins, stored, identity),
-            evaluate=test_metrics, log_path=directory / LOG, provided=parts.since_asked,
+            evaluate=test_metrics, log_path=directory / LOG, provided=parts.since_asked, say=session.say,
         ).train()  # fmt: skip
     return outcome.model, {
         **{name: getattr(outcome, name) for name in TrainBlock.model_fields if hasattr(outcome, name)},

@@ -25,6 +25,8 @@ class SceneOptions:
                     mask only. Blender scenes are always cut out
     legacy_8bit_composite   Blender pictures are composited on the background at load, in 8 bit with truncation, as the
                     3DGS code does; False: in float where they are used
+    exif_turn       whether EXIF turns pictures whose size does not say if poses were made from turned ones; None: it
+                    does not, and that is told
     init_points     how many random start points where there is no SfM
     seed            of those points
     """
@@ -38,6 +40,7 @@ class SceneOptions:
     principal_point: Literal["center", "file"] | None = None
     mask_background: bool | None = None
     legacy_8bit_composite: bool = False
+    exif_turn: bool | None = None
     init_points: int = 100_000
     seed: int = 0
 

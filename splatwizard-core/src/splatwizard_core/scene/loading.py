@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splatwizard_core.errors import SceneError
+from splatwizard_core.errors import SceneError, no_file
 from splatwizard_core.plugins.catalogue import catalogue, package_of
 from splatwizard_core.plugins.guards import one_line
 from splatwizard_core.plugins.manager import PluginManager
@@ -136,6 +136,8 @@ def _recognise(path: Path, families: Families, without: tuple[str, ...] = ()) ->
 def _unrecognised(path: Path, families: Families, asked: list[str]) -> str:
     if path.is_file():
         return f"{path} is a file, not a scene folder"
+    if not path.is_dir():
+        return f"{path}: {no_file(path)}"
     declared = [entry.declared for entry in families]
     looked_for = ", ".join(fields["looks_for"] for fields in declared if "looks_for" in fields)
     told = f"Looked for {looked_for or 'nothing'}; families asked: {', '.join(asked) or 'none'}"

@@ -95,6 +95,7 @@ class Protocol:
     quantize8   renders are rounded to 8 bit before metrics
     masked      pictures were cut out by alpha or mask, beyond what the layout always does
     composite8  pictures with alpha were composited in 8 bit with truncation
+    turned      pictures were turned by EXIF because the user said so (`exif_turn`), not their size
     name        "survey" or "inria" where all of the above is what that named protocol says of a published scene, else
                 "custom"; equal facts are comparable whatever the name, so it is no part of the id
     """
@@ -108,6 +109,7 @@ class Protocol:
     quantize8: bool = True
     masked: bool = False
     composite8: bool = False
+    turned: bool = False
     name: str = "custom"
 
     @property
@@ -117,7 +119,8 @@ class Protocol:
             self.dataset, self.images, f"r{self.resolution}", self.split, self.background,
             f"pp-{self.principal_point}", "q8" if self.quantize8 else "float",
         ]  # fmt: skip
-        return "/".join(parts + ["masked"] * self.masked + ["composite8"] * self.composite8)
+        more = {"masked": self.masked, "composite8": self.composite8, "turned": self.turned}
+        return "/".join(parts + [name for name, holds in more.items() if holds])
 
 
 @dataclass(eq=False)

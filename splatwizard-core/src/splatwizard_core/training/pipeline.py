@@ -79,6 +79,7 @@ class TrainingRun:
                     in eval mode, with the process-wide random states kept
     log_path        of log.jsonl; default: in `directory`
     provided        () -> what served (rasterizers, pruners, ...) since it was last asked: kept by stage
+    say             is told from which step a resumed training goes on
     """
 
     stages: Sequence[Stage]
@@ -98,6 +99,7 @@ class TrainingRun:
     evaluate: Evaluate | None = None
     log_path: Path | None = None
     provided: Callable[[], list[dict[str, str]]] = list
+    say: Callable[[str], None] = log.info
 
     def __post_init__(self) -> None:
         if not self.stages:
@@ -133,6 +135,9 @@ class TrainingRun:
                 self.run_log.clear()
             else:
                 first = trainer.index
+                if not trainer.stopped:
+                    where = f" of stage '{self.names[first]}'" if len(self.stages) > 1 else ""
+                    self.say(f"going on after step {trainer.step:,} of {trainer.stage.iterations:,}{where}")
                 self.run_log.rewind(first, trainer.step)
                 self.provided()  # what began the stage is known from the process that began it
             for index in range(first, len(self.stages)):

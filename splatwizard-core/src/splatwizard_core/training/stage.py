@@ -119,6 +119,13 @@ class Stage:
         """Rasterizers to take first if they are installed; the user's `raster.prefer` goes before them."""
         return ()
 
+    def random_background(self, step: int) -> bool:
+        """Whether this step has a background colour of its own, behind render and picture, without the run's asking.
+
+        It has none where `legacy_8bit_composite` has taken alpha away.
+        """
+        return False
+
     def looked_up(self, scene: Scene | None) -> dict[str, Any]:
         """Return values that the configuration leaves to the scene, by dotted key, JSON-able; None: its keys count."""
         return {}

@@ -101,6 +101,7 @@ class Trainer:
         self._view: View | None = None
         self._one = torch.ones((), device=self.device)
         self._background = scene.background.to(self.device)
+        self._has_alpha = not scene.protocol.composite8
         self._cameras: WeakKeyDictionary[View, Camera] = WeakKeyDictionary()
         self._unchecked: list[StepRecord] = []
         self._asked: tuple[Verdict, list[StepRecord]] | None = None
@@ -146,7 +147,7 @@ class Trainer:
 
         view = self._view = self.sampler.next(step)
         background = self._background
-        if self.ppl.random_background:
+        if self.ppl.random_background or (self._has_alpha and self.stage.random_background(step)):
             background = torch.rand(3, generator=self.streams("background")).to(self.device, non_blocking=True)
         camera = self._camera(view)
         inputs = self.model.gaussians(camera, self.rasterizer)

@@ -56,11 +56,14 @@ class Ply:
 class Lossless:
     """float32 as trained, in spatial order, byte planes and zstd: every bit comes back."""
 
-    def __init__(self, plugins: PluginManager) -> None:
-        self.plugins = plugins
+    Settings = lossless.LosslessSettings
+
+    def __init__(self, plugins: PluginManager, **settings: Any) -> None:
+        self.plugins, self.settings = plugins, lossless.LosslessSettings(**settings)
+        self.settings.check(plugins)
 
     def encode(self, model: GaussianModel, writer: ContainerWriter) -> None:
-        lossless.encode(model, writer, self.plugins)
+        lossless.encode(model, writer, self.plugins, self.settings)
 
     def decode(self, reader: ContainerReader) -> GaussianModel:
         return lossless.decode(reader, self.plugins)

@@ -6,7 +6,7 @@ usual one. Each is tried on a few numbers before anything is trained.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -26,31 +26,45 @@ if TYPE_CHECKING:
     )
 
 
-class Exchangeable(Params):
-    """Settings of a codec with such parts. Usual ones are left out of what is kept: older files and runs have none."""
+class NamedParts(Params):
+    """Settings of a codec with such parts. Usual ones are left out of what is kept: older files and runs have none.
+
+    USUAL   setting -> name of the part where nothing else is asked for
+    """
+
+    USUAL: ClassVar[dict[str, str]] = {}
+
+    @model_serializer(mode="wrap")
+    def _without_usual(self, plain: Callable[[Any], dict[str, Any]]) -> dict[str, Any]:
+        return {key: value for key, value in plain(self).items() if self.USUAL.get(key, ...) != value}
+
+    def named(self) -> dict[str, str]:
+        """Return the parts that are not the usual ones."""
+        given = {part: getattr(self, part) for part in self.USUAL}
+        return {part: name for part, name in given.items() if name != self.USUAL[part]}
+
+    def state(self, writer: ContainerWriter) -> None:
+        """Write the names of parts that are not the usual ones into the header."""
+        writer.static.update(self.named())
+
+
+class Exchangeable(NamedParts):
+    """Settings of a codec of integers and positions."""
 
     USUAL: ClassVar[dict[str, str]] = {"entropy": "columns", "positions": "octree"}
 
     entropy: str = Field("columns", description="entropy model of all but positions: any that codes integer matrices")
     positions: str = Field("octree", description="coder of the positions: any that codes positions")
 
-    @model_serializer(mode="wrap")
-    def _without_usual(self, plain: Callable[[Any], dict[str, Any]]) -> dict[str, Any]:
-        return {key: value for key, value in plain(self).items() if self.USUAL.get(key, "") != value}
-
     def check(self, plugins: PluginManager) -> None:
         """Raise ConfigError for a part that is not installed, or does not do what the codec needs of it."""
-        for part, known, tried in (
-            ("entropy", plugins.entropy_models, _codes_matrices),
-            ("positions", plugins.position_codecs, _codes_positions),
-        ):
-            if (name := getattr(self, part)) != self.USUAL[part]:
-                hold_part(known, name, f"codec.settings.{part}", tried)
-
-    def state(self, writer: ContainerWriter) -> None:
-        """Write the names of parts that are not the usual ones into the header."""
-        named = {part: getattr(self, part) for part in self.USUAL}
-        writer.static.update({part: name for part, name in named.items() if name != self.USUAL[part]})
+        held: dict[str, tuple[Any, Callable[[Any], str]]] = {
+            "entropy": (plugins.entropy_models, codes_matrices),
+            "positions": (plugins.position_codecs, _codes_positions),
+        }  # fmt: skip
+        for part, name in self.named().items():
+            known, tried = held[part]
+            hold_part(known, name, f"codec.settings.{part}", tried)
 
 
 def hold_part(known: Any, name: str, key: str, tried: Callable[[Any], str]) -> None:
@@ -86,6 +100,12 @@ def position_codec(reader: ContainerReader, plugins: PluginManager, max_points: 
     return plugins.position_codecs.load(name)(max_points=max_points)
 
 
+def array_coder(reader: ContainerReader, plugins: PluginManager, part: str, usual: str) -> ArrayCoder:
+    """Return the array coder that a header names as `part`, else the usual one. Raises PluginError."""
+    name = reader.text(part, choices=plugins.array_coders.names) if part in reader.static else usual
+    return plugins.array_coders.load(name)()
+
+
 def decoded_matrix(model: EntropyModel, data: bytes, *shape: int) -> np.ndarray:
     """Return symbols of a shape that an entropy model decodes. Raises BitstreamError for anything else."""
     found = np.asarray(model.decode(data, shape))
@@ -94,7 +114,8 @@ def decoded_matrix(model: EntropyModel, data: bytes, *shape: int) -> np.ndarray:
     return found
 
 
-def _codes_matrices(model: EntropyModel) -> str:
+def codes_matrices(model: EntropyModel) -> str:
+    """Return what an entropy model does wrong with integers, matrices and rows of them; "" for nothing."""
     for symbols in (np.array([[0, -3], [7, 1 << 20], [0, 5]], np.int32), np.arange(4), np.zeros((0, 2), np.int32)):
         found = decoded_matrix(model, model.encode(symbols, None), *symbols.shape)
         if not np.array_equal(found, symbols):
@@ -111,10 +132,11 @@ def _codes_positions(codec: PositionCodec) -> str:
     return "" if np.array_equal(found, ordered) else f"it decodes {ordered.tolist()} as {found.tolist()}"
 
 
-def codes_arrays(coder: ArrayCoder) -> str:
-    """Return what an array coder does wrong with halves and unsigned integers; "" for nothing."""
-    for dtype in (np.float16, np.uint8, np.uint16, np.uint32):
-        array = np.arange(6).reshape(2, 3).astype(dtype)
+def codes_arrays(coder: ArrayCoder, dtypes: Sequence[type] = (np.float16, np.uint8, np.uint16, np.uint32)) -> str:
+    """Return what an array coder does wrong with arrays of these types; "" for nothing."""
+    for dtype in dtypes:
+        is_float = np.issubdtype(dtype, np.floating)
+        array = ((np.arange(6) - 2.5) / 3 if is_float else np.arange(6)).reshape(2, 3).astype(dtype)
         if not np.array_equal(coder.decode(coder.encode(array), dtype, array.shape), array):
             return f"another array comes back of {np.dtype(dtype)}"
     return ""

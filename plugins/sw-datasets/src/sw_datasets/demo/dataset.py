@@ -11,7 +11,7 @@ from sw_datasets.families import DEMO
 from sw_datasets.pictures import fitted_size
 from sw_datasets.rules import rules_for, unused_option_warnings
 
-UNUSED_OPTIONS = ("principal_point", "mask_background", "legacy_8bit_composite", "init_points")
+UNUSED_OPTIONS = ("principal_point", "mask_background", "legacy_8bit_composite", "exif_turn", "init_points")
 """Scene options that change nothing: pictures are drawn, and the size of the scene sets the number of points."""
 
 

@@ -65,7 +65,7 @@ def load_blender(path: Path, rules: Rules, options: SceneOptions) -> Scene:
         path.resolve().name,
         train.views + test.views,
         points=points,
-        protocol=rules.protocol("rgba", masked=gate.masked),
+        protocol=rules.protocol("rgba", masked=gate.masked, turned=gate.turned),
         path=str(path),
         own_split=(train.views, test.views),
         warnings=warnings,

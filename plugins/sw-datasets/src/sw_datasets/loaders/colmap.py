@@ -111,7 +111,7 @@ def load_colmap(path: Path, rules: Rules, options: SceneOptions, *, masks: MaskF
         path.resolve().name,
         views,
         points=points,
-        protocol=rules.protocol(masked=gate.masked),
+        protocol=rules.protocol(masked=gate.masked, turned=gate.turned),
         path=str(path),
         warnings=warnings,
         finds_lists=rules.finds_lists,

@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from splatwizard_core.api import Camera, Scene, SceneError, SceneOptions
+from splatwizard_native import json_reason
 from sw_datasets.assemble import assemble_scene
 from sw_datasets.gate import Gate
 from sw_datasets.loaders.transforms import unused_keys
@@ -67,7 +68,7 @@ def load_enu(path: Path, rules: Rules, options: SceneOptions) -> Scene:
         path.resolve().name,
         views,
         points=points_in_sight([view.camera for view in views], options.init_points, options.seed),
-        protocol=rules.protocol(masked=gate.masked),
+        protocol=rules.protocol(masked=gate.masked, turned=gate.turned),
         path=str(path),
         warnings=warnings,
         finds_lists=rules.finds_lists,
@@ -82,7 +83,7 @@ def read_poses(path: Path) -> tuple[NDArray[np.float64], set[str]]:
     try:
         content = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError) as error:
-        raise SceneError(f"{path}: not readable JSON ({error})", path=str(path)) from error
+        raise SceneError(f"{path}: not readable JSON ({json_reason(error)})", path=str(path)) from error
     poses = content.get("poses") if isinstance(content, dict) else None
     try:
         rows = np.array(poses, dtype=np.float64)

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 from splatwizard_core.api import Camera, PointCloud, Scene, SceneError, SceneOptions, View
+from splatwizard_native import json_reason
 from sw_datasets.assemble import assemble_scene
 from sw_datasets.families import TRANSFORMS
 from sw_datasets.gate import Gate
@@ -91,7 +92,7 @@ class TransformsDataset:
             path.resolve().name,
             found.views,
             points=points,
-            protocol=rules.protocol("frames", masked=gate.masked),
+            protocol=rules.protocol("frames", masked=gate.masked, turned=gate.turned),
             path=str(path),
             own_lists=found.lists,
             warnings=warnings,
@@ -164,7 +165,7 @@ def read_json(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise SceneError(f"{path} is missing: {path.parent} is no such scene", path=str(path)) from None
     except (OSError, ValueError, RecursionError) as error:
-        raise SceneError(f"{path}: not readable JSON ({error})", path=str(path)) from error
+        raise SceneError(f"{path}: not readable JSON ({json_reason(error)})", path=str(path)) from error
     if not isinstance(data, dict):
         raise SceneError(f"{path}: must hold an object with 'camera_angle_x' and 'frames'", path=str(path))
     return data

@@ -1,3 +1,0 @@
-"""Pictures and maps of decoded scenes: depth, normals, alpha, as files."""
-
-__version__ = "0.2.0"

@@ -1,0 +1,41 @@
+"""Things that a viewer shows: a name, pictures of it from any camera, and its Gaussians."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from splatwizard_core.api import Camera
+from sw_view.entries import Opened
+from sw_view.frames import Pixels
+from sw_view.looks import look
+from sw_view.shown_gaussians import ShownGaussians, shown_gaussians
+
+
+@dataclass(frozen=True)
+class Exhibit:
+    """A model as a viewer knows it.
+
+    draw        (camera, mode of `looks.MODES`) -> [H,W,3]; may raise CapabilityError
+    gaussians   (camera) -> Gaussians that a browser draws by itself
+    told        () -> a line about it: counts, bytes, what draws it
+    """
+
+    draw: Callable[[Camera, str], Pixels]
+    gaussians: Callable[[Camera], ShownGaussians]
+    told: Callable[[], str]
+
+
+def exhibit(opened: Opened) -> Exhibit:
+    """Return the exhibit of an opened model."""
+    drawing = opened.drawing
+
+    def told() -> str:
+        drawn_by = ", ".join(sorted(set(drawing.rasterizer.drawn_by.values())))
+        return f"{opened.told}; drawn by {drawn_by} on {drawing.device}" if drawn_by else opened.told
+
+    return Exhibit(
+        draw=lambda camera, mode: look(drawing, camera, mode),
+        gaussians=lambda camera: shown_gaussians(drawing.model, camera, drawing.rasterizer),
+        told=told,
+    )

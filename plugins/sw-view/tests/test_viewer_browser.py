@@ -1,0 +1,240 @@
+"""The page and the viewer in a browser: pictures are those of the rasterizer, nothing is asked of any network.
+
+Needs a Chromium, and for the last test viser; skips without one. `make test-browser` runs it.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from headless_chromium import WEBGL, Chromium, find_chromium
+from PIL import Image
+from sw_view.entries import Opened, find_entries, open_entry
+from sw_view.exhibits import exhibit
+from sw_view.page_file import About, write_page
+from sw_view.shown_cameras import surroundings_of
+
+from splatwizard_core.api import Camera, GaussianModel, RasterOptions, Scene, SceneOptions
+from splatwizard_core.tooling import Choices, NegotiatedRasterizer, load_plugins, load_scene, render_view
+
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(find_chromium() is None, reason="no Chromium is installed")]
+GOLDEN = Path(__file__).parents[3] / "tests" / "golden"
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory) -> Iterator[Chromium]:
+    found = Chromium(find_chromium(), tmp_path_factory.mktemp("profile"), flags=WEBGL)
+    yield found
+    found.close()
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return load_scene("demo:tiny", SceneOptions(), load_plugins())
+
+
+@pytest.fixture(scope="module")
+def model(scene) -> GaussianModel:
+    """Gaussians on the surfaces of the scene: needles and plates, half of them thin air, with strong harmonics."""
+    assert scene.points is not None
+    draw = torch.Generator().manual_seed(3)
+    xyz = scene.points.xyz
+    xyz = xyz + 0.02 * torch.randn(xyz.shape, generator=draw)
+    n = len(xyz)
+    return GaussianModel(
+        xyz, torch.randn(n, 1, 3, generator=draw), 0.3 * torch.randn(n, 15, 3, generator=draw),
+        2 * torch.randn(n, generator=draw), -3.2 + 0.9 * torch.randn(n, 3, generator=draw),
+        torch.randn(n, 4, generator=draw),
+    ).requires_grad_(False)  # fmt: skip
+
+
+def at(address: str) -> Any:
+    """An address as `Chromium.open` wants one."""
+    return SimpleNamespace(resolve=lambda: SimpleNamespace(as_uri=lambda: address))
+
+
+def still(browser: Chromium, page: Path, camera: int, size: tuple[int, int]) -> np.ndarray:
+    """The picture of a camera, [H,W,3] in 0..1."""
+    browser.send("Page.navigate", url="about:blank")  # a change of the fragment alone would load nothing
+    browser.open(at(f"{page.as_uri()}#camera={camera}&size={size[0]}x{size[1]}&still"), width=1280)
+    wait_for(browser, f"document.title === 'still {camera}'")
+    data = browser.ask("document.getElementById('canvas').toDataURL()").partition(",")[2]
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"), np.float64) / 255
+
+
+def wait_for(browser: Chromium, condition: str, seconds: float = 60) -> None:
+    until = time.monotonic() + seconds
+    while not browser.ask(condition):
+        assert browser.ask("document.documentElement.dataset.state") != "failed", browser.complaints()
+        assert time.monotonic() < until, condition
+        time.sleep(0.02)
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    return float(-10 * np.log10(((a - b) ** 2).mean()))
+
+
+def drawn(model: GaussianModel, camera: Camera, options: RasterOptions) -> np.ndarray:
+    rasterizer = NegotiatedRasterizer(load_plugins(), device=torch.device("cpu"))
+    return render_view(model, camera, rasterizer, options).image.clamp(0, 1).permute(1, 2, 0).numpy()
+
+
+@pytest.mark.parametrize("antialias", [False, True])
+@pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0)])
+def test_the_page_shows_what_the_rasterizer_draws(browser, scene, model, tmp_path, background, antialias):
+    page = tmp_path / "scene.html"
+    write_page(model, page, About("toy", background=background, antialias=antialias), surroundings_of(scene))
+    for i, view in enumerate(scene.test):
+        camera = view.camera.resized(256, 192)
+        shown = still(browser, page, i, (camera.width, camera.height))
+        options = RasterOptions(background=torch.tensor(background), antialias=antialias)
+        # 50 dB and more: what is quantized, and Gaussians whose tails the rasterizer cuts at its tiles.
+        assert psnr(shown, drawn(model, camera, options)) > 40
+    assert browser.requests()[0].startswith(page.as_uri())
+    assert all(url.startswith("blob:") for url in browser.requests()[1:])
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2])
+def test_every_degree_of_harmonics_is_drawn(browser, scene, model, tmp_path, degree):
+    part = GaussianModel(model.means, model.sh_dc, model.sh_rest[:, : (degree + 1) ** 2 - 1], model.opacity_logits,
+                         model.log_scales, model.quats).requires_grad_(False)  # fmt: skip
+    page = tmp_path / "scene.html"
+    write_page(part, page, About("toy"), surroundings_of(scene))
+    camera = scene.test[1].camera
+    shown = still(browser, page, 1, (camera.width, camera.height))
+    options = RasterOptions(background=torch.zeros(3))
+    assert psnr(shown, drawn(part, camera, options)) > 40
+    if degree:
+        assert psnr(shown, drawn(model, camera, options)) < 35, "the test would not see a missing band"
+
+
+def test_an_off_centre_camera_of_another_shape_is_drawn_whole(browser, scene, model, tmp_path):
+    view = scene.test[0]
+    camera = replace(view.camera, cx=view.camera.cx + 5, cy=view.camera.cy - 3)
+    around = surroundings_of(scene)
+    named = replace(around.cameras[0], camera=camera)
+    page = tmp_path / "scene.html"
+    write_page(model, page, About("toy"), replace(around, cameras=[named]))
+    shown = still(browser, page, 0, (camera.width, 2 * camera.height))
+    top = camera.height // 2
+    inside = shown[top : top + camera.height]
+    # A larger window clamps the slopes of wide Gaussians elsewhere, so only most of the picture is the same.
+    assert psnr(inside, drawn(model, camera, RasterOptions(background=torch.zeros(3)))) > 30
+
+
+def test_controls_move_the_eye_and_cameras_bring_it_back(browser, scene, model, tmp_path):
+    page = tmp_path / "scene.html"
+    write_page(model, page, About("toy", note="A note."), surroundings_of(scene))
+    browser.send("Page.navigate", url="about:blank")
+    browser.open(page, width=900, height=700)
+    settled = "document.documentElement.dataset.state === 'drawn'"
+    wait_for(browser, settled)
+
+    def picture() -> str:
+        time.sleep(0.5)
+        wait_for(browser, settled)
+        return browser.ask("new Promise(r => requestAnimationFrame(() => r(document.documentElement.dataset.frames)))")
+
+    before = int(picture())
+    browser.key("ArrowRight", 39)
+    browser.key("w", 87)
+    assert int(picture()) > before
+    x, y = 450, 350
+    for kind, dx in (("mousePressed", 0), ("mouseMoved", 40), ("mouseReleased", 40)):
+        browser.send("Input.dispatchMouseEvent", type=kind, x=x + dx, y=y, button="left", buttons=1, clickCount=1)
+    moved = int(picture())
+    browser.key("]", 221)
+    assert browser.ask("document.getElementById('camera').value") == "1"
+    assert int(picture()) > moved
+    browser.key("f", 70)
+    assert browser.ask("document.getElementById('fly').getAttribute('aria-pressed')") == "true"
+    browser.key("h", 72)
+    assert "A note." in browser.ask("document.getElementById('help').innerText")
+    assert not [line for line in browser.complaints() if "ReadPixels" not in line]
+
+
+def test_an_eye_that_sees_nothing_is_shown_the_background(browser, scene, model, tmp_path):
+    around = surroundings_of(scene)
+    near = around.cameras[0].camera
+    away = replace(near, R=torch.diag(torch.tensor([-1.0, 1.0, -1.0])) @ near.R, tau=torch.tensor([0.0, 0.0, -1e4]))
+    page = tmp_path / "scene.html"
+    cameras = [around.cameras[0], replace(around.cameras[0], camera=away)]
+    write_page(model, page, About("toy", background=(1.0, 0.0, 0.0)), replace(around, cameras=cameras))
+    np.testing.assert_array_equal(still(browser, page, 1, (64, 48)), np.broadcast_to([1.0, 0.0, 0.0], (48, 64, 3)))
+
+
+def test_it_fits_a_phone_in_light_and_dark(browser, scene, model, tmp_path):
+    page = tmp_path / "scene.html"
+    write_page(model, page, About("a-title-" * 12, "3dgs", 123456), surroundings_of(scene))
+    for scheme in ("light", "dark"):
+        browser.send("Page.navigate", url="about:blank")
+        browser.open(page, width=390, height=760, scheme=scheme)
+        wait_for(browser, "document.documentElement.dataset.state === 'drawn'")
+        assert browser.ask("document.documentElement.scrollWidth") == 390
+        assert browser.ask("document.documentElement.scrollHeight") == 760
+        ground = browser.ask("getComputedStyle(document.body).backgroundColor")
+        assert (sum(map(int, ground[4:-1].split(","))) < 200) == (scheme == "dark")
+
+
+def test_a_damaged_page_says_so(browser, scene, model, tmp_path):
+    page = tmp_path / "scene.html"
+    write_page(model, page, About("toy"), surroundings_of(scene))
+    text = page.read_text("utf-8")
+    at_data = text.index('id="gaussians">') + 500
+    page.write_text(text[:at_data] + "!" + text[at_data + 1 :], "utf-8")
+    browser.send("Page.navigate", url="about:blank")
+    browser.open(page, width=600)
+    until = time.monotonic() + 30
+    while browser.ask("document.documentElement.dataset.state") != "failed":
+        assert time.monotonic() < until
+        time.sleep(0.05)
+    assert browser.ask("!document.getElementById('told').hidden && document.getElementById('told').textContent !== ''")
+
+
+@pytest.fixture(scope="module")
+def opened() -> Opened:
+    return open_entry(find_entries(GOLDEN / "3dgs_r3_v1.swz")[0], Choices(scene="demo:tiny"), load_plugins())
+
+
+def test_a_browser_is_sent_the_picture_of_its_camera(browser, opened):
+    pytest.importorskip("viser", reason="pip install 'sw-view[viser]'")
+    from sw_view.viewer import Viewer, start_server
+
+    viewer = Viewer(start_server("127.0.0.1", 0), opened.around, ["golden"], lambda _label: exhibit(opened))
+    done = threading.Event()
+
+    def pump() -> None:
+        while not done.is_set():
+            viewer.pump(0.05)
+
+    thread = threading.Thread(target=pump)
+    thread.start()
+    part = (slice(240, 480), slice(0, 300))  # the panel and messages are above and to the right
+    best, until = 0.0, time.monotonic() + 60
+    try:
+        browser.open(at(viewer.address), width=640, height=480)
+        while best <= 30:
+            assert time.monotonic() < until, f"the browser shows something else: {best:.1f} dB"
+            time.sleep(0.2)
+            for visitor in viewer._visitors.values():
+                camera = visitor.camera(1.0)
+                assert (camera.width, camera.height) == (640, 480)
+                sent = exhibit(opened).draw(camera, "picture")
+                data = browser.send("Page.captureScreenshot", format="png")["data"]
+                shown = np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
+                best = max(best, psnr(shown[part] / 255, sent[part] / 255))
+    finally:
+        done.set()
+        thread.join()
+        viewer.stop()

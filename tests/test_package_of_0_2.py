@@ -1,0 +1,76 @@
+"""The example of a third party as of 0.2, unchanged, is installed beside this release and runs."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from fresh_environments import ROOT, FreshEnvironment, build_wheels
+
+pytestmark = pytest.mark.pipeline
+
+PACKAGE = ROOT / "tests" / "golden" / "packages_0_2" / "sw-third-party"
+UNCHANGED = "6fe18339dd33df47"
+SHORT = ("--set", "pretrained.iterations=40", "--set", "iterations=10")
+
+
+def files_of_the_package() -> list[Path]:
+    return sorted(path for path in PACKAGE.rglob("*") if path.is_file() and "__pycache__" not in path.parts)
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    (built,) = build_wheels([PACKAGE], tmp_path_factory.mktemp("of_0_2"))
+    return built
+
+
+@pytest.fixture(scope="module")
+def beside(tmp_path_factory: pytest.TempPathFactory, core_environment, wheels, wheel) -> FreshEnvironment:
+    """All of ours as they are now, and the package, whose metadata asks for 0.2."""
+    environment = core_environment.clone(tmp_path_factory.mktemp("beside") / "env")
+    environment.install(*(each for name, each in wheels.items() if name != "splatwizard-core"), wheel)
+    return environment
+
+
+def test_it_is_as_it_was():
+    content = hashlib.sha256()
+    for path in files_of_the_package():
+        content.update(path.relative_to(PACKAGE).as_posix().encode() + b"\0" + path.read_bytes())
+    assert content.hexdigest()[:16] == UNCHANGED
+    assert '"splatwizard-core>=0.2,<0.3"' in (PACKAGE / "pyproject.toml").read_text("utf-8")
+
+
+def test_it_runs_and_its_file_decodes(beside, tmp_path):
+    listed = beside.plugins()["sw-third-party"]
+    assert listed["error"] is None
+    assert [each["name"] for each in listed["provides"]] == ["opacity-prune"]
+    beside.run("run", "--method", "opacity-prune", "--scene", "demo:tiny", "--out", str(tmp_path / "out"), *SHORT)
+    (path,) = (tmp_path / "out").glob("**/metrics.json")
+    record = json.loads(path.read_text())
+    assert math.isfinite(record["metrics"]["psnr"]["mean"])
+    decoded = json.loads(beside.run("decode", str(path.parent / "scene.swz"), "--json").stdout)
+    assert decoded["digest"] == record["file"]["digest"]
+
+
+def test_its_own_tests_pass_and_say_which_import_path_is_old(beside, tmp_path):
+    shutil.copytree(PACKAGE / "tests", tmp_path / "tests")
+    done = subprocess.run(
+        [str(beside.python), "-m", "pytest", "-q", "--import-mode=importlib", "-p", "no:cacheprovider", "tests"],
+        **{**beside._surroundings({}), "cwd": tmp_path}, capture_output=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout
+    assert "DeprecationWarning: sw_finetuning is sw_gaussians.finetune now" in done.stdout
+
+
+def test_pip_tells_that_its_metadata_forbids_this_release(beside):
+    """As 0.2 told authors to write it; so pip installs it only with --no-deps, or before the upgrade."""
+    done = subprocess.run(
+        [str(beside.python), "-m", "pip", "check"], **beside._surroundings({}), capture_output=True, check=False
+    )
+    assert "sw-third-party 0.1.0 requires sw-finetuning, which is not installed" in done.stdout
+    assert "sw-third-party 0.1.0 has requirement splatwizard-core<0.3,>=0.2, but you have" in done.stdout
