@@ -49,7 +49,7 @@ PARTS = {
     "sw_cat_3dgs.plane_coder:PlaneCoder.encode": "triplane",
     "sw_cat_3dgs.plane_coder:PlaneCoder.decode": "triplane",
     "sw_{}.codec:CatContext.places": "places",
-    "sw_{}.predictors:ExactPredictor.shift": "channel networks",
+    "sw_{}.rate_model:ExactPredictor.shift": "channel networks",
     "sw_anchors.attribute_sections:ExactNetwork.outputs": "context networks",
     "sw_anchors.attribute_sections:ExactNetwork.on_lattice": "context networks",
     "sw_codecs.entropy.conditional:ConditionalGaussian.encode": "symbols",

@@ -31,7 +31,7 @@ from torch import Tensor, nn
 from splatwizard_core.api import BitstreamError
 from sw_cat_3dgs.context import PLANES, CatContext, ContextShape
 from sw_cat_3dgs.model import CatAnchors
-from sw_cat_3dgs.predictors import PREDICTORS, Predictor
+from sw_cat_3dgs.rate_model import CatRateModel, Predictor
 from sw_cat_3dgs.stage import base_resolution
 from sw_cat_3dgs.triplane import GAIN
 from sw_codecs.entropy.rows import RowContext
@@ -65,7 +65,7 @@ def encode(model: CatAnchors, writer: ContainerWriter, config: CatConfig, plugin
     _use_integers(context, planes)
 
     attributes = AttributeEncoder(model, rows, sections(context.shape), mode, plugins)
-    predictor = PREDICTORS[mode](context)
+    predictor = CatRateModel.of_file(context).predictor(mode)
     if len(rows):
         with one_thread() if mode == "float" else torch.no_grad():
             walk(attributes, predictor, context.places(geometry.codes, geometry.bounds), geometry.masks)
@@ -95,7 +95,7 @@ def decode(reader: ContainerReader, plugins: PluginManager) -> DecodedAnchors:
         expected = coder.Context(arms, shape.planes(resolution))
         _use_integers(context, expected.split(coder.decode(data, expected)))
     with reader.decoding("networks"):
-        predictor = PREDICTORS[mode](context)
+        predictor = CatRateModel.of_file(context).predictor(mode)
 
     attributes = AttributeDecoder(reader, model, sections(shape), mode, plugins)
     if n:

@@ -66,6 +66,8 @@ class CatContext(nn.Module):
     in_steps    the network gives means and scales as multiples of base steps, not in the units of the values
     """
 
+    step_offset = STEP_OFFSET
+
     frame: Tensor
     triplane: Triplane
     network: nn.Sequential

@@ -31,7 +31,7 @@ def fits(parts: Parts, x: Tensor) -> bool:
 def with_bits(parts: Parts, x: Tensor) -> tuple[Tensor, Tensor]:
     """Return what `mixed_grid.with_bits` returns, where it `fits`; not differentiable for x."""
     grids = [(axes, levels_of(grid)) for axes, grid in parts]
-    features, bits = _SignLookup.apply(x.detach().contiguous(), grids, *(grid.table for _, grid in parts))
+    features, bits = _SignLookup.apply(x.detach().contiguous(), grids, *(grid.table for _, grid in parts))  # type: ignore[no-untyped-call]
     return features, bits
 
 
@@ -66,13 +66,6 @@ class _SignLookup(torch.autograd.Function):
         total = torch.zeros_like(table)
         add_sign_gradients(x, ctx.grids, to_features, total.split(ctx.sizes))
         return None, None, *_through_signs(total, table, to_bits * dearer).split(ctx.sizes)
-
-
-def _through_signs(total: Tensor, table: Tensor, to_ones: Tensor) -> Tensor:
-    """Gradient of learned numbers from those of their signs, in place, and of the number of positive ones."""
-    total += to_ones / 2  # a sign is twice its bit, less one
-    total *= table.abs() <= 1
-    return total
 
 
 def _through_signs(total: Tensor, table: Tensor, to_ones: Tensor) -> Tensor:

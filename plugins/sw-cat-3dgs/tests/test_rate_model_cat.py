@@ -5,7 +5,7 @@ import torch
 from sw_anchors.shape import GROUPS
 
 from sw_cat_3dgs.context import CatContext
-from sw_cat_3dgs.predictors import PREDICTORS
+from sw_cat_3dgs.rate_model import CatRateModel
 from sw_cat_3dgs.triplane import UNIT
 
 
@@ -18,12 +18,12 @@ def test_wide_contexts_are_computed_a_few_anchors_at_a_time(mode, method, monkey
     context.rounded = True
     places = torch.randint(0, UNIT + 1, (200, 3), generator=generator)
     with torch.no_grad():
-        whole = PREDICTORS[mode](context).first(places)
+        whole = CatRateModel.of_file(context).predictor(mode).first(places)
         seen, limit = [], 30 * context.triplane.width
         monkeypatch.setattr("sw_anchors.attribute_sections.EXACT_NUMBERS", limit)
-        monkeypatch.setattr("sw_cat_3dgs.predictors.FLOAT_NUMBERS", limit)
+        monkeypatch.setattr("sw_cat_3dgs.rate_model.FLOAT_NUMBERS", limit)
         context.network.register_forward_pre_hook(lambda _, inputs: seen.append(len(inputs[0])))
-        predictor = PREDICTORS[mode](context)
+        predictor = CatRateModel.of_file(context).predictor(mode)
         if mode == "exact":
             lookup = predictor._lookup
             predictor._lookup = lambda part: (seen.append(len(part)), lookup(part))[1]
