@@ -161,6 +161,7 @@ SHELVES = {"sw_rasterizers", "sw_codecs", "sw_gaussians", "sw_anchors", "sw_fine
 """Libraries for methods: what stands there serves two families, or can be chosen by name."""
 FOR_ONE = {
     "sw_gaussians.bake_refining": "trains on pictures that sw-view gives it, with the stage of sw-gaussians",
+    "sw_gaussians.baking": "explicit Gaussians of any model, beside the class that they become",
 }
 """Module of a library that one family alone reaches -> why it is there; at most ten in the end."""
 
