@@ -109,6 +109,21 @@ def test_channel_networks_are_evaluated_a_few_rows_at_a_time(mode, limit, monkey
         assert torch.allclose(torch.cat(found.found[group], dim=1), torch.cat(whole.found[group], dim=1))
 
 
+@pytest.mark.parametrize("kind", ["full", "tiny", "none"])
+def test_the_rate_of_training_is_the_size_of_the_file(kind):
+    """The rate model that training minimises, of the very values that the file holds."""
+    model = make(n=6000, channel__kind=kind)
+    recorder, _ = recorded(model)
+    _, rows = kept_voxels(model)
+    values = torch.cat([part for group in GROUPS for part in recorder.found[group]], dim=1)
+    with torch.no_grad():
+        forecast = model.rate_model.forecast(model.context_of(rows), slice(0, None))
+        bits, _ = model.rate_model.rate(values, forecast, model.masks(rows), torch.ones(len(rows)))
+    sections = ContainerReader(encoded(model)).sections
+    size = 8 * sum(sections[name] for name in codec.sections(model.channel))
+    assert float(bits) == pytest.approx(size, rel=0.02)
+
+
 def test_decoding_leaves_the_global_generator_alone():
     data = encoded(make(n=20))
     before = torch.get_rng_state()
