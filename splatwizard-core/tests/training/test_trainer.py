@@ -267,9 +267,9 @@ def test_a_stage_may_ask_for_random_backgrounds_of_its_own(toy):
     stage.random_background = lambda step: step <= 3
     trainer = make_trainer(toy, stage, scene=toy.make_scene(rgba=True))
     trainer.run(5, lambda record: None)
-    *fresh, before_last, last = (tuple(b.tolist()) for b in trainer.rasterizer.backgrounds)
+    *fresh, before_last, last = (tuple(b.tolist()) for b in trainer.state.rasterizer.backgrounds)
     assert len({*fresh, last}) == 4
-    assert before_last == last == tuple(trainer.scene.background.tolist())
+    assert before_last == last == tuple(trainer.state.scene.background.tolist())
 
 
 def test_clamp_render_cuts_the_image_before_the_loss(toy):
