@@ -160,7 +160,6 @@ SHELVES = {"sw_rasterizers", "sw_codecs", "sw_gaussians", "sw_anchors", "sw_refe
 FOR_ONE = {
     "sw_gaussians.baking": "makes explicit Gaussians of a model for sw-view, and knows the parts of GaussianModel",
     "sw_gaussians.bake_refining": "trains on pictures that sw-view gives it, with the stage of sw-gaussians",
-    "sw_gaussians.baking": "explicit Gaussians of any model, beside the class that they become",
 }
 """Module of a library that one family alone reaches -> why it is there; at most ten in the end."""
 

@@ -130,7 +130,7 @@ def test_untrained_slices_refine_nothing_and_the_parts_sum_to_the_whole(begun, l
     model.phase = ENTROPY
     rows = torch.arange(model.num_rows)
     plain = model.predict(rows)
-    refined = model.refine(plain, model.features[rows])
+    refined = model.context.refine(plain, model.features[rows])
     assert torch.equal(refined.means[0], plain.means[0])
     assert torch.equal(refined.scales[0], plain.scales[0])
     inputs = model.gaussians(little_scene.train[0].camera, rasterizer)
@@ -183,7 +183,7 @@ def test_what_training_forecasts_for_a_sample_is_what_is_predicted(begun, values
     rows, drawn = torch.arange(model.num_rows).flip(0), torch.tensor([3, 1])
     learned = [p for name, p in model.context.named_parameters() if not name.startswith("arms")]
     noisy = torch.cat(model.raw(rows), dim=1).detach()
-    context = model.refine(model.predict(rows), noisy[:, : model.features.shape[1]])
+    context = model.context.refine(model.predict(rows), noisy[:, : model.features.shape[1]])
     forecast = model.rate_model.forecast(model.context_of(rows), drawn)
     mean, scale = model.rate_model.read(forecast, noisy[drawn])
     expected = [torch.cat(parts, dim=1) for parts in (context.steps, context.means, context.scales)]

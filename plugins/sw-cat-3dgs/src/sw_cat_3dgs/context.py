@@ -21,7 +21,8 @@ from torch import Tensor, nn
 from splatwizard_native import fast_enabled
 from sw_cat_3dgs import spatial_ar
 from sw_cat_3dgs.channel_ar import ChannelAr
-from sw_cat_3dgs.fast import plane_bits, plane_sites, slices
+from sw_cat_3dgs.fast import plane_bits as fast_bits
+from sw_cat_3dgs.fast import plane_sites, slices
 from sw_cat_3dgs.principal_frame import PrincipalFrame
 from sw_cat_3dgs.spatial_ar import ExactSpatialAr, SpatialAr
 from sw_cat_3dgs.triplane import GAIN, Triplane
@@ -162,7 +163,7 @@ class CatContext(nn.Module):
 
     def outputs(self, places: Tensor) -> Tensor:
         """Outputs [V, sum(shape.outputs)] of the network for anchors at places [V,3]."""
-        look_up = plane_sites.look_up if plane_sites.fits(list(self.triplane.planes)) else Triplane.forward
+        look_up = plane_sites.look_up if plane_sites.fits(self.triplane) else Triplane.forward
         found: Tensor = self.network(look_up(self.triplane, places, rounded=self.rounded))
         return found
 
@@ -198,5 +199,14 @@ class CatContext(nn.Module):
         chosen = torch.argsort(noise(channels))[:count] if count < channels else None
         planes = [plane if chosen is None else plane.index_select(1, chosen) for plane in self.triplane.planes]
         values = [add_noise(GAIN * plane, plane.new_ones(()), noise(*plane.shape)) for plane in planes]
-        bits = plane_bits.plane_bits if plane_bits.fits(values) else spatial_ar.plane_bits
+        bits = fast_bits.plane_bits if fast_bits.fits(values) else spatial_ar.plane_bits
         return bits(self.spatial_models, values) * (channels / count)
+
+
+def plane_bits(context: CatContext, share: float, generator: torch.Generator | None) -> Tensor:
+    """Estimate the bits of the planes from a share of their channels; differentiable.
+
+    generator   of the noise, on the device of the planes; None: the default one there
+    """
+    device = context.frame.device
+    return context.triplane_bits(lambda *shape: torch.rand(shape, generator=generator, device=device), share)

@@ -11,9 +11,8 @@ from sw_anchors.rate_model import AnchorContext, Context
 from torch import Tensor
 
 from splatwizard_core.api import Camera, Rasterizer
-from sw_cat_3dgs.context import STEP_OFFSET, CatContext
-from sw_cat_3dgs.fast import plane_sites
-from sw_cat_3dgs.fast.plane_graphs import FixedPlaneBits
+from sw_cat_3dgs.context import STEP_OFFSET, CatContext, plane_bits
+from sw_cat_3dgs.fast import plane_graphs, plane_sites
 from sw_cat_3dgs.rate_model import CatRateModel
 
 Trained = Literal["everything", "spatial models", "all but planes", "nothing"]
@@ -26,7 +25,6 @@ class CatAnchors(CodedAnchors):
     views_stale     anchors came or went since the views were counted
     context         predicts attributes
     trained         parameters that get gradients
-    fixed_planes    estimates the planes' bits in training; None: nothing does. Whoever trains sets it
     """
 
     ROWS = (*CodedAnchors.ROWS, "view_weights")
@@ -42,12 +40,10 @@ class CatAnchors(CodedAnchors):
         self.trained: Trained = "everything"
         self.register_buffer("view_weights", self.anchors.new_ones(len(self.anchors)))
         self._places: tuple[tuple[Any, ...], Tensor] | None = None
-        self._sites: tuple[Tensor, int, plane_sites.PlaneSites] | None = None
-        self.fixed_planes: FixedPlaneBits | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """A copy works out anew where its anchors lie."""
-        return {**self.__dict__, "_places": None, "_sites": None, "fixed_planes": None}
+        return {**self.__dict__, "_places": None}
 
     def mask_weights(self) -> Tensor:
         return self.view_weights[:, None]
@@ -76,14 +72,8 @@ class CatAnchors(CodedAnchors):
 
     def context_rows(self) -> Context:
         """The places of the anchors in the triplane; their sites on the planes, where `fast` takes these."""
-        planes = list(self.context.triplane.planes)
-        if not plane_sites.fits(planes):
-            return (self.places(),)
-        places = self.places()
-        if self._sites is None or self._sites[0] is not places or self._sites[1] != self.context.resolution:
-            self._sites = None  # the old ones go before the new ones come
-            self._sites = places, self.context.resolution, plane_sites.sites_of(planes, places)
-        return self._sites[2]
+        triplane, places = self.context.triplane, self.places()
+        return plane_sites.kept_sites(triplane, places) if plane_sites.fits(triplane) else (places,)
 
     @property
     def rate_model(self) -> CatRateModel:
@@ -91,15 +81,8 @@ class CatAnchors(CodedAnchors):
 
     def plane_bits(self, share: float) -> Tensor:
         """Estimate the bits of the planes from a share of their channels; differentiable."""
-        if self.fixed_planes is not None and torch.is_grad_enabled():
-            own = self.noise is not None and self.noise.device.type == self.device.type
-            found = self.fixed_planes(self.context, share, self.noise if own else None)
-            if found is not None:
-                return found
-        return self.context.triplane_bits(self.uniform, share)
-
-    def refine(self, context: AnchorContext, features: Tensor) -> AnchorContext:
-        return self.context.refine(context, features)
+        estimate = plane_graphs.plane_bits if plane_graphs.fits(self.context) else plane_bits
+        return estimate(self.context, share, self.own_generator())
 
     def train_only(self, trained: Trained) -> None:
         """Give gradients to these parameters alone."""

@@ -13,9 +13,8 @@ from sw_anchors.phase_switch import PhaseSwitch
 from sw_anchors.stage import CodedAnchorStage, Weighted
 
 from splatwizard_core.api import CameraIterator, LossPack, Rasterizer, SplatOptimizer, TaskLog
-from splatwizard_native import fast_enabled
 from sw_cat_3dgs.config import FULL_RUN, CatConfig
-from sw_cat_3dgs.fast.plane_graphs import FixedPlaneBits
+from sw_cat_3dgs.fast import plane_graphs
 from sw_cat_3dgs.model import CatAnchors, Trained
 
 if TYPE_CHECKING:
@@ -45,14 +44,11 @@ class CatStage(CodedAnchorStage):
     def begin(self, context: StageContext) -> SplatModel:
         self.plane_draws = context.generator("triplane")
         self._cameras: list[Camera] | None = None
-        model = super().begin(context)
-        assert isinstance(model, CatAnchors)
-        model.fixed_planes = FixedPlaneBits() if fast_enabled() and model.device.type == "cuda" else None
-        return model
+        return super().begin(context)
 
     def finish(self, model: SplatModel, scene: Scene) -> SplatModel:
         assert isinstance(model, CatAnchors)
-        model.fixed_planes = None
+        plane_graphs.release(model.context)
         return super().finish(model, scene)
 
     # Optimizer

@@ -7,7 +7,7 @@ import pytest
 import torch
 from sw_anchors.testing import check_plain, check_replayed
 
-from sw_cat_3dgs.fast.plane_graphs import FixedPlaneBits
+from sw_cat_3dgs.fast.plane_graphs import ESTIMATORS, FixedPlaneBits
 
 
 @pytest.fixture
@@ -37,7 +37,9 @@ def test_fixed_sizes_change_neither_values_nor_gradients(model, little_scene, ro
 
 
 def plane_bits(model, fixed, share, seed=0):
-    model.fixed_planes = fixed
+    ESTIMATORS.pop(model.context, None)
+    if fixed is not None:
+        ESTIMATORS[model.context] = fixed
     model.noise = torch.Generator(model.device).manual_seed(seed)
     model.zero_grad()
     bits = model.plane_bits(share)
@@ -51,8 +53,13 @@ def plane_bits(model, fixed, share, seed=0):
 def test_bits_of_the_planes_are_the_same(model, monkeypatch, trained, share):
     model.train_only(trained)
     drawn = []
-    uniform = model.uniform
-    monkeypatch.setattr(model, "uniform", lambda *shape: drawn.append(uniform(*shape)) or drawn[-1].clone())
+    rand = torch.rand
+
+    def recorded(shape, **kwargs):
+        drawn.append(rand(shape, **kwargs))
+        return drawn[-1].clone()
+
+    monkeypatch.setattr(torch, "rand", recorded)
     expected, slopes = plane_bits(model, None, share)
     noise = torch.cat([each.flatten() for each in drawn])
     fixed = FixedPlaneBits(graphs=False)

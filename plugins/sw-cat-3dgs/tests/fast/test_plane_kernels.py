@@ -111,7 +111,7 @@ def test_a_triplane_and_its_gradients_are_those_of_torch(count, resolution, chan
     slopes = torch.randn(len(places), planes.width, generator=draw)
     slopes[count // 3 : count // 3 + 2] = 0  # rows beyond the count of a step have none
     planes, slopes, places = planes.to("cuda"), slopes.to("cuda"), places.to("cuda")
-    assert plane_sites.fits(list(planes.planes))
+    assert plane_sites.fits(planes)
     found = []
     for look_up in (plane_sites.look_up, Triplane.forward):
         features = look_up(planes, places, rounded=rounded)

@@ -29,11 +29,11 @@ def places(count, seed=1):
 
 
 def test_the_environment_can_do_without(monkeypatch):
-    planes = list(drawn_triplane(4, 3, (1, 2)).planes)
-    assert plane_bits.fits(planes)
+    made = drawn_triplane(4, 3, (1, 2))
+    assert plane_bits.fits(list(made.planes))
     monkeypatch.setenv("SW_FAST", "0")
-    assert not plane_bits.fits(planes)
-    assert not plane_sites.fits(planes)
+    assert not plane_bits.fits(list(made.planes))
+    assert not plane_sites.fits(made)
 
 
 @pytest.mark.parametrize("rounded", [True, False])
@@ -41,7 +41,7 @@ def test_the_environment_can_do_without(monkeypatch):
 @pytest.mark.parametrize("resolution", [1, 4])
 def test_features_of_a_triplane(resolution, multiples, rounded):
     made = drawn_triplane(resolution, 3, multiples)
-    if not plane_sites.fits(list(made.planes)):
+    if not plane_sites.fits(made):
         pytest.skip("no compiler")
     weights = torch.randn(33, made.width, generator=generator(2))
     found = [each(made, places(30), rounded=rounded) for each in (plane_sites.look_up, Triplane.forward)]
@@ -64,6 +64,16 @@ def test_sites_of_some_places_are_rows_of_all(resolution):
         assert (cells // size == torch.arange(3)[:, None]).all()
     torch.testing.assert_close(sites.weights.sum(dim=3), torch.ones(23, 2, 3))
     assert (sites.weights >= 0).all()
+
+
+def test_sites_are_kept_until_places_or_resolution_are_others():
+    made, given = drawn_triplane(4, 3, (1, 2)), places(5)
+    first = plane_sites.kept_sites(made, given)
+    assert plane_sites.kept_sites(made, given) is first
+    assert plane_sites.kept_sites(made, given.clone()) is not first
+    again = plane_sites.kept_sites(made, given)
+    made.planes[0] = torch.nn.Parameter(torch.zeros(3, 3, 7, 7))
+    assert not torch.equal(plane_sites.kept_sites(made, given).cells, again.cells)
 
 
 @pytest.mark.parametrize("at_once", [1, 2 * 3 * 72, 1 << 20])

@@ -25,12 +25,12 @@ def fits(rows: Context) -> bool:
 
 def forecast(context: CatContext, base: Tensor, rows: Context, drawn: Rows) -> AnchorForecast:
     """As `rate_model.forecast`, for rows that are PlaneSites."""
-    assert isinstance(drawn, Tensor)
     first, last = linear_layers(context.network)
     sizes = [sum(context.shape.outputs[:-1]), len(GROUPS)]
     weights, biases = torch.split(last.weight, sizes), torch.split(last.bias, sizes)
     features = sample(list(context.triplane.planes), PlaneSites(*rows), rounded=context.rounded)
     parameters = (first.weight, first.bias, weights[1], biases[1])
     steps, hidden = predicted_steps(features, parameters, base, offset=context.step_offset)
-    sample_steps, own = take_rows(drawn, steps, hidden)
+    sampled = drawn if isinstance(drawn, Tensor) else torch.arange(len(steps), device=steps.device)[drawn]
+    sample_steps, own = take_rows(sampled, steps, hidden)
     return AnchorForecast(steps, sample_steps, nn.functional.linear(own, weights[0], biases[0]))

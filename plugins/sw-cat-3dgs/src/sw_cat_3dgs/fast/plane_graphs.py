@@ -6,19 +6,40 @@ import functools
 import logging
 import math
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import torch
 from sw_anchors.fast.graphs import CapturedStep, FixedStep, Found, PlainStep, Watched, add_gradients
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from splatwizard_native import fast_enabled
 from sw_cat_3dgs.context import CatContext
+from sw_cat_3dgs.context import plane_bits as plain_bits
 
 log = logging.getLogger(__name__)
 
 
+def fits(context: CatContext) -> bool:
+    """Whether the bits of its planes are taken from graphs: in training on a GPU."""
+    return fast_enabled() and torch.is_grad_enabled() and (context in ESTIMATORS or context.frame.is_cuda)
+
+
+def plane_bits(context: CatContext, share: float, generator: torch.Generator | None) -> Tensor:
+    """As `context.plane_bits`."""
+    if context not in ESTIMATORS:
+        ESTIMATORS[context] = FixedPlaneBits()
+    found = ESTIMATORS[context](context, share, generator)
+    return plain_bits(context, share, generator) if found is None else found
+
+
+def release(context: CatContext) -> None:
+    """Forget the graphs of a context, which hold memory."""
+    ESTIMATORS.pop(context, None)
+
+
 class FixedPlaneBits:
-    """`CatContext.triplane_bits` of one context, as graphs that are made anew when planes or networks are others."""
+    """`context.plane_bits` of one context, as graphs that are made anew when planes or networks are others."""
 
     def __init__(self, *, graphs: bool = True) -> None:
         """graphs: as CUDA graphs; else operator by operator, on any device."""
@@ -32,8 +53,7 @@ class FixedPlaneBits:
     def __call__(self, context: CatContext, share: float, generator: torch.Generator | None) -> Tensor | None:
         """Estimate the bits; differentiable. None where no graph can be made or none has room, which is said once.
 
-        share       of the channels, as of `triplane_bits`
-        generator   of the noise; None: the default one of the device
+        share, generator    as of `context.plane_bits`
         """
         if self._failed:
             return None
@@ -99,3 +119,7 @@ class _Bits(torch.autograd.Function):
     def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
         add_gradients(ctx.learning, ctx.step.backward([slope]))
         return None, None, None
+
+
+ESTIMATORS: WeakKeyDictionary[CatContext, FixedPlaneBits] = WeakKeyDictionary()
+"""Graphs of the contexts that train."""

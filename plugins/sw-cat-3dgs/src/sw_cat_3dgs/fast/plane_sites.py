@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
@@ -57,13 +58,23 @@ def sites_of(planes: Sequence[Tensor], places: Tensor) -> PlaneSites:
     return PlaneSites(torch.stack(cells, dim=1).view(shape), torch.stack(weights, dim=1).view(shape))
 
 
-def fits(planes: Sequence[Tensor]) -> bool:
-    """Whether there are kernels for these planes [3, C, R, R]; loads them."""
+def fits(triplane: Triplane) -> bool:
+    """Whether there are kernels for its planes; loads them."""
+    planes = list(triplane.planes)
     if not fast_enabled():
         return False
     if all(plane.device.type == "cpu" and plane.dtype == torch.float32 for plane in planes):
         return 0 < len(planes) <= MOST_SCALES and planes[0].numel() > 0 and CODECS.try_load()
     return fit_kernels(planes)
+
+
+def kept_sites(triplane: Triplane, places: Tensor) -> PlaneSites:
+    """`sites_of` the places, worked out anew when these are another tensor or the planes have another resolution."""
+    size, kept = triplane.planes[0].shape[-1], KEPT.get(triplane)
+    if kept is None or kept[0] is not places or kept[1] != size:
+        KEPT.pop(triplane, None)  # the old ones go before the new ones come
+        KEPT[triplane] = kept = places, size, sites_of(list(triplane.planes), places)
+    return kept[2]
 
 
 def sample(planes: Sequence[Tensor], sites: PlaneSites, *, rounded: bool) -> Tensor:
@@ -115,3 +126,7 @@ def _as_plane(table: Tensor, shape: Sequence[int]) -> Tensor:
     """A plane [3, C, H, W] of `shape` from its table [3 H W, C]."""
     k, channels, h, w = shape
     return table.view(k, h, w, channels).movedim(3, 1).contiguous()
+
+
+KEPT: WeakKeyDictionary[Triplane, tuple[Tensor, int, PlaneSites]] = WeakKeyDictionary()
+"""Places of all anchors, the size of the coarsest planes, and the sites there."""
