@@ -54,8 +54,8 @@ PARTS = {
     "sw_anchors.attribute_sections:ExactNetwork.on_lattice": "context networks",
     "sw_anchors.attribute_sections:ConditionalGaussian.encode": "symbols",
     "sw_anchors.attribute_sections:ConditionalGaussian.decode_into": "symbols",
-    "sw_anchors.attribute_sections:ConditionalMixture.encode": "mixtures",
-    "sw_anchors.attribute_sections:ConditionalMixture.decode": "mixtures",
+    "sw_hac_plus.codec:ConditionalMixture.encode": "mixtures",
+    "sw_hac_plus.codec:ConditionalMixture.decode": "mixtures",
     "sw_anchors.attribute_sections:SteRound.encode": "rounding",
 }
 """Module and attribute -> part; `{}` is the method."""
