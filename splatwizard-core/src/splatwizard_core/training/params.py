@@ -177,6 +177,10 @@ class OptimizationParams(Params):
         """Return values by dotted key with today's keys in place of shorthands and of those of older releases."""
         return values
 
+    def settings_keys(self, plugins: Any) -> dict[str, str]:
+        """Map dotted keys of settings of what it names in `plugins` to their descriptions."""
+        return {}
+
     def completed(self, plugins: Any, sources: Mapping[str, str]) -> "OptimizationParams":
         """Return this with checked settings of what it names in `plugins`; sources: dotted key -> who gave a value."""
         return self
