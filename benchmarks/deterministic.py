@@ -311,21 +311,23 @@ def timed(method: str, args: argparse.Namespace, gpu: str) -> dict[str, Any]:
 
 def operations(device: str) -> dict[str, Callable[[], list[Tensor]]]:
     """Name -> () -> tensors whose bits must be equal each time; sizes of a real step."""
-    from sw_anchors.fixed_step import sample_of
-    from sw_anchors.fused_ops import add_rows
+    from sw_anchors.fast.fixed_step import sample_of
+    from sw_anchors.fast.fused_ops import add_rows
+    from sw_anchors.fast.networks import network_outputs
+    from sw_anchors.fast.pool_rows import bernoulli_rows
+    from sw_anchors.fast.seen_rows import ExpectedRows
     from sw_anchors.neural_gaussians import visible_gaussians
-    from sw_anchors.pool_rows import bernoulli_rows
-    from sw_anchors.seen_rows import ExpectedRows
-    from sw_anchors.view_networks import network_outputs
     from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_scene
 
     from splatwizard_core.api import RasterOptions, photometric_loss
+    from sw_cat_3dgs.fast import plane_bits, plane_sites
+    from sw_cat_3dgs.spatial_ar import SpatialAr
+    from sw_cat_3dgs.triplane import Triplane
     from sw_codecs.codebooks.kmeans import kmeans
-    from sw_codecs.context.hash_grid import HashGrid, MixedHashGrid
-    from sw_codecs.context.spatial_ar import SpatialAr
-    from sw_codecs.context.triplane import Triplane
+    from sw_codecs.context.hash_grid import HashGrid
     from sw_codecs.context.two_layers import two_layers
     from sw_codecs.quantizers.residual_quantizer import ResidualVectorQuantizer
+    from sw_hac.mixed_grid import MixedHashGrid
     from sw_rasterizers.standard import StandardRasterizer
     from sw_rasterizers.surfel import SurfelRasterizer
 
@@ -358,9 +360,9 @@ def operations(device: str) -> dict[str, Callable[[], list[Tensor]]]:
     signs = MixedHashGrid(generator=draw).to(device)
     few, many = torch.rand(60_000, 3, generator=draw).to(device), torch.rand(300_000, 3, generator=draw).to(device)
     grid_slopes, sign_slopes = normal(len(many), grid.width), normal(len(few), signs.width)
-    triplane = Triplane(64, 72, (1, 2), generator=draw).to(device)
-    sites = triplane.sites(torch.randint(0, 1 << 16, (60_000, 3), generator=draw).to(device))
-    plane_slopes = normal(60_000, triplane.width)
+    learned = list(Triplane(64, 72, (1, 2), generator=draw).to(device).planes)
+    sites = plane_sites.sites_of(learned, torch.randint(0, 1 << 16, (60_000, 3), generator=draw).to(device))
+    plane_slopes = normal(60_000, 2 * 3 * 72)
     arms = [SpatialAr(draw).to(device) for _ in range(3)]
     planes = [(normal(3, 72, n, n) * 3).requires_grad_() for n in (64, 128)]
     k = 10
@@ -378,7 +380,7 @@ def operations(device: str) -> dict[str, Callable[[], list[Tensor]]]:
     picture, truth = torch.rand(3, 800, 800, device=device, requires_grad=True), torch.rand(3, 800, 800, device=device)
 
     def of_planes() -> list[Tensor]:
-        bits = SpatialAr.joint_bits(arms, planes)
+        bits = plane_bits.plane_bits(arms, planes)
         learning = [*planes, *(p for arm in arms for p in arm.parameters())]
         return [bits.detach(), *torch.autograd.grad(bits, learning)]
 
@@ -422,7 +424,7 @@ def operations(device: str) -> dict[str, Callable[[], list[Tensor]]]:
         "hash grid (Compact3DGS)": looked_up(grid, many, grid_slopes),
         "grids of signs (HAC)": looked_up(signs, few, sign_slopes),
         "triplane (CAT-3DGS)": lambda: list(
-            torch.autograd.grad((triplane.at_sites(sites) * plane_slopes).sum(), list(triplane.planes))
+            torch.autograd.grad((plane_sites.sample(learned, sites, rounded=True) * plane_slopes).sum(), learned)
         ),
         "bits of planes (CAT-3DGS)": of_planes,
         "Gaussians of anchors": spawned,

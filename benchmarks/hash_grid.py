@@ -15,8 +15,7 @@ import time
 import torch
 
 from splatwizard_native import synchronize
-from sw_codecs.context import hash_grid
-from sw_codecs.context.grid_lookup import fits_kernel
+from sw_codecs.context.fast import grid_lookup
 from sw_codecs.context.hash_grid import HashGrid
 
 
@@ -54,14 +53,14 @@ def main() -> None:
     # As Gaussians are: most of them close to surfaces, here around the middle of the contracted cube.
     x = (0.5 + 0.1 * torch.randn(asked.n, 3, generator=generator)).clamp(0, 1).to(asked.device)
     print(f"{asked.n:,} places, {len(grid.levels)} levels, {len(grid.table):,} entries, {asked.device}")
-    kernels = fits_kernel(grid, x, grid.table)
+    kernels = grid_lookup.fits(grid, x, grid.table)
     found = {}
     for way in ("kernels", "torch"):
         if way == "kernels" and not kernels:
             print("no compiled kernels")
             continue
         if way == "torch":
-            hash_grid.fits_kernel = lambda *_: False
+            grid_lookup.fits = lambda *_: False
         forward, backward, peak, _ = found[way] = measure(grid, x, asked.repeats)
         told = f"  {peak / 1e6:8.1f} MB" if asked.device == "cuda" else ""
         print(f"{way:8} forward {1e3 * forward:8.3f} ms  backward {1e3 * backward:8.3f} ms{told}")

@@ -47,7 +47,7 @@ os.environ.setdefault("TEARDOWN_CUPTI", "0")
 import torch
 from scene_names import FORMS, split_scene
 from step_parts import SECTION, kernel_times, longest_kernels, report
-from sw_anchors import fused_ops, mixture_bits, view_networks
+from sw_anchors.fast import fused_ops, mixture_bits, view_networks
 from torch.profiler import ProfilerActivity, profile, record_function
 
 from splatwizard_core.gaussians.inputs import rgb_to_dc
@@ -66,7 +66,7 @@ from splatwizard_core.training.stage import StageContext
 from splatwizard_core.training.state import TrainingState
 from splatwizard_core.training.trainer import StepRecord, Trainer
 from splatwizard_native import seeded, work_time
-from sw_codecs.context import spatial_ar, triplane
+from sw_cat_3dgs.fast import plane_kernels, plane_sites
 
 # Attribute paths from the trainer -> the part of a step that its calls belong to; what a version lacks is left out.
 # Of nested ones the innermost counts.
@@ -83,8 +83,7 @@ PARTS = {
     "model.context.slices.forward": "context MLPs",
     "model._looked_up": "grid or planes",
     "model.context.triplane.forward": "grid or planes",
-    "model._kept_places": "grid or planes",
-    "model.context.triplane.at_sites": "grid or planes",
+    "model.context_rows": "grid or planes",
     "model.context.triplane_bits": "planes' rate",
     "model.rate": "rate",
     "stage.loss": "loss",
@@ -142,7 +141,7 @@ class Summary:
 def kernels_off() -> Iterator[None]:
     """Do without the kernels of rows and planes, as before there were any."""
     with ExitStack() as stack:
-        for module in (fused_ops, spatial_ar, triplane):
+        for module in (fused_ops, plane_kernels, plane_sites):
             stack.enter_context(mock.patch.object(module, "fit_kernels", return_value=False))
         stack.enter_context(mock.patch.object(view_networks, "fit_kernel", return_value=False))
         stack.enter_context(mock.patch.object(mixture_bits, "bits_fit_kernel", return_value=False))

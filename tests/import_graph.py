@@ -5,7 +5,8 @@ from __future__ import annotations
 import ast
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -27,8 +28,11 @@ STRANGERS = sorted(p for folder in ("examples", "tests/plugins") for p in ROOT.g
 """Packages as third parties would write them."""
 
 
-def imported(path: Path) -> Iterator[str]:
-    """Dotted names of all modules that a file imports, at any depth but under `if TYPE_CHECKING:`."""
+def imported(path: Path, *, types: bool = False) -> Iterator[str]:
+    """Dotted names of all modules that a file imports, at any depth.
+
+    types: also those under `if TYPE_CHECKING:`
+    """
 
     def visit(node: ast.AST) -> Iterator[str]:
         if isinstance(node, ast.Import):
@@ -37,7 +41,7 @@ def imported(path: Path) -> Iterator[str]:
             assert node.level == 0, f"{path}: relative import"
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
         typing_only = isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING")
-        for child in node.orelse if typing_only else ast.iter_child_nodes(node):
+        for child in node.orelse if typing_only and not types else ast.iter_child_nodes(node):
             yield from visit(child)
 
     return visit(ast.parse(path.read_text(encoding="utf-8")))
@@ -53,9 +57,18 @@ def module_name(path: Path, package: Path) -> str:
 
 
 @cache
-def module_graph() -> Mapping[str, frozenset[str]]:
-    """Module -> the modules of the workspace that it imports when it runs, function-level imports included."""
-    files = {module_name(p, package): p for package in (NATIVE, CORE, *PACKAGES) for p in files_of(package)}
+def module_files() -> Mapping[str, Path]:
+    """Module of the workspace -> its file."""
+    return {module_name(p, package): p for package in (NATIVE, CORE, *PACKAGES) for p in files_of(package)}
+
+
+@cache
+def module_graph(*, types: bool = False) -> Mapping[str, frozenset[str]]:
+    """Module -> the modules of the workspace that it imports when it runs, function-level imports included.
+
+    types: also those that it imports for a type checker alone
+    """
+    files = module_files()
 
     def home(name: str) -> str | None:
         """The module that a dotted name is or lies in."""
@@ -64,9 +77,60 @@ def module_graph() -> Mapping[str, frozenset[str]]:
         return name or None
 
     return {
-        module: frozenset(found for name in imported(path) if (found := home(name)) is not None and found != module)
+        module: frozenset(
+            found for name in imported(path, types=types) if (found := home(name)) is not None and found != module
+        )
         for module, path in files.items()
     }
+
+
+def reached(modules: Iterable[str], *, but: Callable[[str], bool] = lambda _: False) -> set[str]:
+    """The modules outside core and native that these import, directly or through others, and these themselves.
+
+    but: modules whose imports are followed no further than to others that it says yes to
+    """
+    graph, found, waiting = module_graph(), set[str](), list(modules)
+    while waiting:
+        module = waiting.pop()
+        if module in found or module.startswith("splatwizard_"):
+            continue
+        found.add(module)
+        waiting += [other for other in graph[module] if not but(module) or but(other)]
+    return found
+
+
+def is_fast(module: str) -> bool:
+    """Whether a module lies in a folder `fast`."""
+    return "fast" in module_files()[module].parts[:-1]
+
+
+def lines_of(module: str) -> int:
+    """Lines of a module."""
+    return len(module_files()[module].read_text(encoding="utf-8").splitlines())
+
+
+@dataclass(frozen=True)
+class Closure:
+    """What a reader must follow to read a module: its imports, and theirs, outside core and native.
+
+    modules, lines  without those in folders `fast`, and without modules of at most 5 lines
+    fast            lines in folders `fast` that are reached
+    """
+
+    modules: int
+    lines: int
+    fast: int
+
+    @classmethod
+    def of(cls, module: str) -> Closure:
+        """That of a module."""
+        sizes = {each: lines_of(each) for each in reached([module], but=is_fast)}
+        sizes = {each: lines for each, lines in sizes.items() if lines > 5}
+        plain = [lines for each, lines in sizes.items() if not is_fast(each)]
+        return cls(len(plain), sum(plain), sum(sizes.values()) - sum(plain))
+
+    def __str__(self) -> str:
+        return f"{self.modules} modules, {self.lines:,} lines, +{self.fast:,} in fast/"
 
 
 def circles(graph: Mapping[str, frozenset[str]]) -> list[list[str]]:

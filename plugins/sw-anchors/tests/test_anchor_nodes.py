@@ -1,39 +1,32 @@
 """The parts of an anchor model that are one node of the graph each, against the same written out."""
 
+import copy
+
 import pytest
 import torch
-from sw_anchors.fixed_step import sample_capacity
-from sw_anchors.fused_ops import anchor_values, mean_product, take_rows, weighted_sum, widen
-from sw_anchors.neural_gaussians import spawn, visible_gaussians
+from sw_anchors import neural_gaussians, stage
+from sw_anchors.fast import loss, spawn
+from sw_anchors.fast import noisy_values as fast_values
+from sw_anchors.fast.fixed_step import bernoulli_rows, sample_capacity
+from sw_anchors.fast.rows import take_rows
+from sw_anchors.native import ANCHORS
 from sw_anchors.noisy_values import Noise, noisy_values
-from sw_anchors.pool_rows import bernoulli_rows
 
 from splatwizard_native import seeded
 from sw_codecs.context.two_layers import two_layers
 
+needs_kernels = pytest.mark.skipif(ANCHORS.available() is not None, reason=str(ANCHORS.available()))
+PARTS = ("means", "opacities", "scales", "quats", "colors", "all_opacities", "alphas", "drawn")
 
-def written_out(center, positions, features, offsets, scales, masks, networks):
-    k = offsets.shape[1]
-    toward = positions - center
-    distance = torch.linalg.vector_norm(toward, dim=1, keepdim=True)
-    context = torch.cat([features, toward / distance, distance], dim=1)
-    opacity, covariance, color = networks
-    opacities = torch.tanh(opacity(context))
-    if masks is not None:
-        opacities = opacities * masks
-    drawn = torch.nonzero(opacities.reshape(-1) > 0).squeeze(1)
-    owner = drawn // k
-    geometry = covariance(context).reshape(-1, 7)[drawn]
-    own = scales[owner]
-    return (
-        positions[owner] + offsets.reshape(-1, 3)[drawn] * own[:, :3],
-        opacities.reshape(-1)[drawn],
-        own[:, 3:].abs() * torch.sigmoid(geometry[:, :3]),
-        torch.nn.functional.normalize(geometry[:, 3:], dim=1),
-        torch.sigmoid(color(context)).reshape(-1, 3)[drawn],
-        opacities,
-        drawn,
-    )
+
+def of_dtype(dtype, center, tensors, masks, networks):
+    """Leaves of the dtype, and the arguments of `spawn` made of them."""
+    tensors = [t.detach().to(dtype).requires_grad_(t.requires_grad) for t in tensors]
+    masks = None if masks is None else masks.detach().to(dtype).requires_grad_()
+    networks = tuple(copy.deepcopy(network).to(dtype) for network in networks)
+    parameters = [p for network in networks for p in network.parameters()]
+    leaves = [t for t in (*tensors, *([] if masks is None else [masks])) if t.requires_grad] + parameters
+    return leaves, (center.to(dtype), *tensors, masks, networks)
 
 
 def gradients(found, leaves, generator):
@@ -42,35 +35,30 @@ def gradients(found, leaves, generator):
     return torch.autograd.grad(total, leaves)
 
 
+@needs_kernels
 @pytest.mark.parametrize("masked", [True, False])
 @pytest.mark.parametrize("learns", [True, False])
-@pytest.mark.parametrize(("n", "dtype", "tolerance"), [(250, torch.float32, 1e-5), (40, torch.float64, 1e-10),
-                                                       (0, torch.float32, 0)])  # fmt: skip
-def test_spawning_equals_the_same_written_out(masked, learns, n, dtype, tolerance):
+@pytest.mark.parametrize("n", [250, 0])
+def test_spawning_by_kernels_equals_the_plain_form(masked, learns, n):
     """With positions that learn, networks and Gaussians are apart; else on the CPU they are one kernel."""
     g, k, width = torch.Generator().manual_seed(0), 5, 7
-
-    def leaf(*shape):
-        return torch.randn(shape, generator=g).to(dtype).requires_grad_()
-
-    networks = tuple(two_layers(width + 4, 6, out * k, g).to(dtype) for out in (1, 7, 3))
-    masks = (torch.rand(n, k, generator=g) > 0.3).to(dtype).requires_grad_() if masked else None
-    tensors = [leaf(n, 3), leaf(n, width), leaf(n, k, 3), leaf(n, 6)]
-    center = torch.tensor([0.3, -2.0, 5.0], dtype=dtype)
+    networks = tuple(two_layers(width + 4, 6, out * k, g) for out in (1, 7, 3))
+    masks = (torch.rand(n, k, generator=g) > 0.3).float() if masked else None
+    tensors = [torch.randn(size, generator=g).requires_grad_() for size in ((n, 3), (n, width), (n, k, 3), (n, 6))]
     tensors[0].requires_grad_(learns)
-    own = tensors if learns else tensors[1:]
-    leaves = [*own, *([masks] if masked else []), *(p for network in networks for p in network.parameters())]
-    expected = written_out(center, *tensors, masks, networks)
-    found = spawn(center, *tensors, masks, networks)
-    found = tuple(getattr(found, name) for name in
-                  ("means", "opacities", "scales", "quats", "colors", "all_opacities", "drawn"))  # fmt: skip
-    for a, b in zip(found, expected, strict=True):
-        torch.testing.assert_close(a, b, atol=tolerance, rtol=tolerance)
-    pairs = [gradients(each, leaves, torch.Generator().manual_seed(1)) for each in (found, expected)]
+    given = torch.tensor([0.3, -2.0, 5.0]), tensors, masks, networks
+    pairs = []
+    for form, dtype in ((spawn.spawn, torch.float32), (neural_gaussians.spawn, torch.float64)):
+        leaves, arguments = of_dtype(dtype, *given)
+        assert spawn.fits(*arguments[1:-1]) == (dtype == torch.float32)
+        found = form(*arguments)
+        found = [getattr(found, name) for name in PARTS]
+        pairs.append([*found, *gradients(found, leaves, torch.Generator().manual_seed(1))])
     for a, b in zip(*pairs, strict=True):
-        torch.testing.assert_close(a, b, atol=10 * tolerance, rtol=10 * tolerance)
+        torch.testing.assert_close(a.to(b.dtype), b, atol=1e-4, rtol=1e-4)  # float32 sums over 250 rows
 
 
+@needs_kernels
 @pytest.mark.parametrize("threads", [2, 5])
 def test_one_kernel_gives_the_same_bits_on_any_number_of_threads(threads):
     g, n, k = torch.Generator().manual_seed(0), 3000, 8
@@ -81,7 +69,7 @@ def test_one_kernel_gives_the_same_bits_on_any_number_of_threads(threads):
         for count in (1, threads):
             torch.set_num_threads(count)
             leaves = [t.clone().requires_grad_() for t in tensors[1:]]
-            spawned = spawn(torch.zeros(3), tensors[0], *leaves, None, networks)
+            spawned = spawn.spawn(torch.zeros(3), tensors[0], *leaves, None, networks)
             parts = (spawned.means, spawned.opacities, spawned.scales, spawned.quats, spawned.colors)
             learning = [*leaves, *(p for network in networks for p in network.parameters())]
             total = sum((part * part).flatten()[:: i + 2].sum() for i, part in enumerate(parts))
@@ -92,11 +80,12 @@ def test_one_kernel_gives_the_same_bits_on_any_number_of_threads(threads):
     assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
 
 
+@needs_kernels
 def test_gradients_of_networks_are_aligned_for_the_optimizer():
     g, k = torch.Generator().manual_seed(0), 2
     networks = tuple(two_layers(9, 5, out * k, g) for out in (1, 7, 3))  # 45 weights in each first layer
-    found = spawn(torch.zeros(3), *(torch.randn(size, generator=g) for size in ((6, 3), (6, 5), (6, k, 3), (6, 6))),
-                  None, networks)  # fmt: skip
+    tensors = (torch.randn(size, generator=g) for size in ((6, 3), (6, 5), (6, k, 3), (6, 6)))
+    found = spawn.spawn(torch.zeros(3), *tensors, None, networks)
     (found.means.sum() + found.opacities.sum() + found.scales.sum() + found.colors.sum()).backward()
     for network in networks:
         for parameter in network.parameters():
@@ -112,38 +101,39 @@ def test_values_and_masks_equal_indexing(weighted):
     features, log_scales, offsets, logits = leaves
     weights = torch.rand(n, 1, generator=g, dtype=torch.float64) if weighted else None
     rows = torch.tensor([7, 0, 3, 8])
-    values, masks = anchor_values(rows, *leaves, weights, 0.4)
+    values = noisy_values(rows, tuple(leaves), weights, 0.4, None, torch.tensor([1, 3]))
+    found = torch.cat([values.features, values.scales, values.offsets.flatten(1)], dim=1)
     soft = torch.sigmoid(logits)[rows] * (weights[rows] if weighted else 1)
     expected = torch.cat([features[rows], log_scales[rows].exp(), offsets[rows].flatten(1)], dim=1)
-    torch.testing.assert_close(values, expected)
-    assert torch.equal(masks, (soft > 0.4).to(soft))
-    assert set(masks.unique().tolist()) == {0.0, 1.0}
-    to_values, to_masks = torch.randn(values.shape, generator=g).double(), torch.randn(4, k, generator=g).double()
-    found = torch.autograd.grad((values * to_values).sum() + (masks * to_masks).sum(), leaves)
+    torch.testing.assert_close(found, expected)
+    torch.testing.assert_close(values.sample, expected[[1, 3]])
+    assert torch.equal(values.masks, (soft > 0.4).to(soft))
+    to_values, to_masks = torch.randn(found.shape, generator=g).double(), torch.randn(4, k, generator=g).double()
+    found = torch.autograd.grad((found * to_values).sum() + (values.masks * to_masks).sum(), leaves)
     right = torch.autograd.grad((expected * to_values).sum() + (soft * to_masks).sum(), leaves)
     for a, b in zip(found, right, strict=True):
         torch.testing.assert_close(a, b)
 
 
+@needs_kernels
 @pytest.mark.parametrize("weighted", [True, False])
 @pytest.mark.parametrize("steps", ["none", "of all", "of each"])
-def test_noisy_values_of_the_kernel_equal_those_of_operators(weighted, steps):
-    """float64 has no kernel."""
+def test_noisy_values_of_the_kernel_equal_the_plain_form(weighted, steps):
     g, n, k = torch.Generator().manual_seed(0), 700, 3
     tables = [torch.randn(size, generator=g) for size in ((n, 5), (n, 6), (n, k, 3), (n, k))]
     rows = torch.randperm(n, generator=g)[:600]
     drawn = torch.nonzero(torch.rand(600, generator=g) < 0.1).squeeze(1)
     weights = torch.rand(n, 1, generator=g) if weighted else None
-    step = torch.rand((3,) if steps == "of all" else (600, 3), generator=g)
+    step = torch.rand((1, 3) if steps == "of all" else (600, 3), generator=g)
     uniform, slopes = torch.rand(600, 5 + 6 + 3 * k, generator=g), torch.randn(600, 5 + 6 + 4 * k, generator=g)
-    group = torch.tensor([0] * 5 + [1] * 6 + [2] * 3 * k)
     found = []
-    for dtype in (torch.float32, torch.float64):
+    for form, dtype in ((fast_values.noisy_values, torch.float32), (noisy_values, torch.float64)):
         leaves = [t.to(dtype).requires_grad_() for t in tables]
         own = step.to(dtype).requires_grad_(steps == "of each")
-        columns = group, torch.nn.functional.one_hot(group, 3).to(dtype)
-        noise = None if steps == "none" else Noise(own, uniform.to(dtype), columns)
-        values = noisy_values(rows, tuple(leaves), None if weights is None else weights.to(dtype), 0.4, noise, drawn)
+        noise = None if steps == "none" else Noise(own, uniform.to(dtype))
+        own_weights = None if weights is None else weights.to(dtype)
+        assert fast_values.fits(tuple(leaves), own_weights) == (dtype == torch.float32)
+        values = form(rows, tuple(leaves), own_weights, 0.4, noise, drawn)
         parts = [values.features, values.scales, values.offsets.flatten(1), values.masks]
         total = (torch.cat(parts, dim=1) * slopes.to(dtype)).sum() + values.sample.square().sum()
         learning = [*leaves, *([own] if steps == "of each" else [])]
@@ -152,18 +142,16 @@ def test_noisy_values_of_the_kernel_equal_those_of_operators(weighted, steps):
         torch.testing.assert_close(a.double(), b.double(), atol=2e-5, rtol=2e-5)  # exp in float32
 
 
-def test_rows_columns_and_products_have_their_gradients():
+def test_rows_and_products_have_their_gradients():
     g = torch.Generator().manual_seed(0)
     a, b, scales = (torch.randn(n, 3, generator=g, dtype=torch.float64).requires_grad_() for n in (6, 6, 5))
-    rows, group = torch.tensor([4, 1, 5]), torch.tensor([0, 0, 1, 2, 2])
-    one_hot = torch.nn.functional.one_hot(group, 3).double()
-    assert torch.equal(widen(a, group, one_hot), a[:, group])
-    assert torch.autograd.gradcheck(lambda x: widen(x, group, one_hot), a)
+    rows = torch.tensor([4, 1, 5])
     assert all(torch.equal(x, y[rows]) for x, y in zip(take_rows(rows, a, b), (a, b), strict=True))
     assert torch.autograd.gradcheck(lambda x, y: take_rows(rows, x, y), (a, b))
-    torch.testing.assert_close(mean_product(scales), scales.prod(dim=1).mean())
-    assert torch.autograd.gradcheck(mean_product, scales)
-    assert float(mean_product(torch.zeros(0, 3))) == 0
+    for mean_product in (loss.mean_product, stage.mean_product):
+        torch.testing.assert_close(mean_product(scales), scales.prod(dim=1).mean())
+        assert torch.autograd.gradcheck(mean_product, scales)
+        assert float(mean_product(torch.zeros(0, 3))) == 0
 
 
 @pytest.mark.cuda
@@ -177,7 +165,7 @@ def test_spawning_on_a_gpu_equals_spawning_on_the_cpu():
     for device in ("cpu", "cuda"):
         moved = tuple(network.to(device) for network in networks)
         leaves = [t.to(device).requires_grad_() for t in (*tensors[1:], masks)]
-        spawned = spawn(tensors[0].to(device), *leaves, moved)
+        spawned = spawn.spawn(tensors[0].to(device), *leaves, moved)
         leaves += [p for network in moved for p in network.parameters()]
         parts = (spawned.means, spawned.opacities, spawned.scales, spawned.quats, spawned.colors)
         gradients = torch.autograd.grad(sum(part.square().mean() for part in parts), leaves)
@@ -195,7 +183,7 @@ def test_where_it_is_asked_for_gradients_of_an_anchor_are_the_same_each_time_and
 
     def gradients(device):
         leaves = [t.to(device).requires_grad_() for t in (*tensors, masks)]
-        found = visible_gaussians(*leaves)
+        found = spawn.visible_gaussians(*leaves)
         parts = (found.means, found.opacities, found.scales, found.quats, found.colors)
         return torch.autograd.grad(sum(part.pow(3).sum() for part in parts), leaves)
 
@@ -222,7 +210,8 @@ def test_a_sample_of_all_rows_draws_each_with_its_probability(share):
     assert float(found.std()) == pytest.approx(spread, rel=0.05, abs=1e-6)  # rows are drawn independently
 
 
-def test_a_weighted_sum_is_the_sum_of_products():
+@pytest.mark.parametrize("weighted_sum", [loss.weighted_sum, stage.weighted_sum])
+def test_a_weighted_sum_is_the_sum_of_products(weighted_sum):
     start, a, b = (torch.tensor(x, dtype=torch.float64, requires_grad=True) for x in (0.3, -2.0, 5.0))
     total, *parts = weighted_sum(start, (0.5, a), (-3.0, b))
     assert float(total.detach()) == pytest.approx(0.3 - 1 - 15)

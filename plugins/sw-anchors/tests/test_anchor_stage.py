@@ -7,9 +7,9 @@ import pytest
 import torch
 from sw_anchors.anchors import AnchorModel
 from sw_anchors.coded_anchors import CodedAnchors
+from sw_anchors.fast.networks import network_outputs
 from sw_anchors.params import AnchorGrowth, AnchorParams, CodedAnchorLearningRates, CodedAnchorParams
 from sw_anchors.stage import AnchorStage, CodedAnchorStage
-from sw_anchors.view_networks import network_outputs
 from sw_gaussians.resolution import ResolutionPlan, ResolutionSampler
 from sw_reference.rasterizer import ReferenceRasterizer
 

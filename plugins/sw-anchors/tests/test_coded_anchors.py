@@ -1,16 +1,15 @@
 """Anchors with a lattice, masks and phases: what HAC and CAT-3DGS share."""
 
 import copy
-import dataclasses
 import math
 
 import pytest
 import torch
 from sw_anchors.coded_anchors import ENTROPY, FULL, QUANTIZED, CodedAnchors
 from sw_anchors.decoded_anchors import DecodedAnchors
-from sw_anchors.forecasts import AnchorContext
 from sw_anchors.growth import adjust_anchors
 from sw_anchors.lattice import TOP, bounds_of, coded_positions, position_codes
+from sw_anchors.rate_model import AnchorForecast, gaussian_rate
 from sw_reference.rasterizer import ReferenceRasterizer
 from sw_reference.testing.raster_scenes import front_camera
 
@@ -20,27 +19,53 @@ from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
 RASTERIZER = ReferenceRasterizer()
 
 
+class FlatRate:
+    """One distribution for all anchors; deviations of the features are those of the anchors, if there are any."""
+
+    def __init__(self, log_steps, shape, floors, deviations=None):
+        self.log_steps, self.shape, self.floors, self.deviations = log_steps, shape, floors, deviations
+
+    def forecast(self, context, sample):
+        (rows,) = context
+        steps = self.log_steps.exp().expand(len(rows), 3)
+        scales = torch.ones(len(rows), sum(self.shape.widths))
+        if self.deviations is not None:
+            scales = torch.cat([self.deviations[rows], scales[:, self.shape.features :]], dim=1)
+        return AnchorForecast(steps, steps[sample], scales[sample])
+
+    def rate(self, values, forecast, masks, counted):
+        scale = forecast.outputs
+        return gaussian_rate(
+            values, torch.zeros_like(values), scale, forecast.sample_steps, masks, counted, self.floors
+        )
+
+
 class Flat(CodedAnchors):
-    """One distribution for all anchors."""
+    """CodedAnchors with a FlatRate."""
+
+    deviations = None
 
     def __init__(self, *args, **kwargs):
         super().__init__(*args, **kwargs)
         self.log_steps = torch.nn.Parameter(torch.tensor([0.0, math.log(0.01), math.log(0.2)]))
 
-    def predict(self, rows):
-        n, k = len(rows), self.num_offsets
-        widths = (self.features.shape[1], 6, 3 * k)
-        steps = self.log_steps.exp()
-        return AnchorContext(
-            tuple(torch.zeros(n, w) for w in widths),
-            tuple(torch.ones(n, w) for w in widths),
-            tuple(step.expand(n, 1) for step in steps),
-        )
+    def context_rows(self):
+        return (torch.arange(self.num_rows),)
+
+    @property
+    def rate_model(self):
+        return FlatRate(self.log_steps, self.shape, self.floors, self.deviations)
 
 
-def make(n=8, k=4, feature_dim=5, seed=0, **kwargs):
+class FlatOfAll(Flat):
+    """The same with a rate of a sample of all anchors."""
+
+    RATE_OF = "all"
+
+
+def make(n=8, k=4, feature_dim=5, seed=0, kind=Flat, **kwargs):
     g = torch.Generator().manual_seed(seed)
-    return Flat(
+    return kind(
         torch.rand(n, 3, generator=g) * 2 - torch.tensor([1.0, 1.0, -3.0]),
         torch.randn(n, feature_dim, generator=g),
         torch.randn(n, k, 3, generator=g),
@@ -134,41 +159,52 @@ def test_the_rate_of_a_whole_sample_is_that_of_all_kept_anchors():
     rows = torch.arange(60)
     rate = model.attributes(rows).extras["rate"]
     assert rate.numbers == 40 * (5 + 6 + 12)
-    masks, forecast = model.masks(rows), model.forecast(rows)
-    values = tuple(v.detach() for v in model.raw(rows))
-    again = model.rate(rows, torch.cat(values, dim=1), forecast, masks)
+    masks, values = model.masks(rows), tuple(v.detach() for v in model.raw(rows))
+    kept = masks.detach().amax(dim=1)
+    forecast = model.rate_model.forecast(model.context_of(rows), rows)
+    bits_of_all, by_group = model.rate_model.rate(torch.cat(values, dim=1), forecast, masks, kept)
     normal = torch.distributions.Normal(0.0, 1.0)
     probability = normal.cdf(values[2] + 0.1) - normal.cdf(values[2] - 0.1)
     bits = -torch.log2(probability.clamp(min=1e-6)) * masks.repeat_interleave(3, 1)
-    torch.testing.assert_close(again.by_group[2], bits[20:].sum().detach(), rtol=1e-4, atol=0.01)
-    torch.testing.assert_close(again.bits, again.by_group.sum() / rate.numbers * 40 / 60)
+    torch.testing.assert_close(by_group[2], bits[20:].sum().detach(), rtol=1e-4, atol=0.01)
+    torch.testing.assert_close(bits_of_all.detach(), by_group.sum())
+    torch.testing.assert_close(rate.bits.detach(), rate.by_group.sum() / rate.numbers * 40 / 60)
 
 
 @pytest.mark.parametrize("floor", [0.0, 0.05])
 def test_deviations_below_zero_learn_if_there_is_a_floor(floor):
     """Of features half a step beside the mean; at the published floor of 1e-9 the bits say nothing of the deviation."""
     model = make(n=20, scale_floor=floor)
-    raw = torch.full((20, 5), -0.5, requires_grad=True)
-    flat = model.predict
-    model.predict = lambda rows: dataclasses.replace(flat(rows), scales=(raw[rows], *flat(rows).scales[1:]))
+    raw = model.deviations = torch.full((20, 5), -0.5, requires_grad=True)
     rows = torch.arange(20)
-    forecast = model.forecast(rows)
+    forecast = model.rate_model.forecast(model.context_of(rows), rows)
     values = torch.cat([torch.full((20, 5), 0.55), *(v.detach() for v in model.raw(rows)[1:])], dim=1)
-    rate = model.rate(rows, values, forecast, model.masks(rows))
-    rate.bits.backward()
+    bits, by_group = model.rate_model.rate(values, forecast, model.masks(rows), torch.ones(20))
+    bits.backward()
     if floor:
         assert bool((raw.grad < 0).all())  # descent raises them
     else:
         assert bool((raw.grad == 0).all())
-    assert rate.by_group[0] > 100 * (2.0 if floor else 19.9)
+    assert by_group[0] > 100 * (2.0 if floor else 19.9)
 
 
-def test_an_empty_sample_costs_nothing():
-    model = make()
+@pytest.mark.parametrize("kind", [Flat, FlatOfAll])
+def test_an_empty_sample_costs_nothing(kind):
+    model = make(kind=kind)
     model.phase, model.sample = ENTROPY, 0.0
     rate = model.attributes(torch.arange(8)).extras["rate"]
-    assert (float(rate.bits), rate.numbers) == (0.0, 0)
-    assert float(model.attributes(torch.arange(0)).extras["rate"].bits) == 0.0
+    assert (float(rate.bits.detach()), rate.numbers) == (0.0, 0)
+    assert float(model.attributes(torch.arange(0)).extras["rate"].bits.detach()) == 0.0
+
+
+def test_the_rate_may_be_that_of_a_sample_of_all_anchors():
+    """Under noise of its own: what a view sees has no part in it."""
+    model = make(n=60, kind=FlatOfAll)
+    model.phase, model.sample = ENTROPY, 1.0
+    rate = model.attributes(torch.arange(3)).extras["rate"]
+    assert rate.numbers == 60 * (5 + 6 + 12)
+    rate.bits.backward()
+    assert bool((model.features.grad != 0).any(dim=1).all())
 
 
 def test_masks_remove_gaussians_and_learn_from_picture_and_rate():
@@ -245,12 +281,11 @@ def test_far_values_are_clamped_about_the_mean_of_the_kept():
     assert float(found) == pytest.approx(round(mean) + 15_000)
 
 
-def test_constants_of_the_columns_stay_where_they_are():
+def test_base_steps_stay_where_they_are():
     """A CUDA graph reads them by address, whatever is computed in another dtype meanwhile."""
     model, like = make(), torch.zeros(1)
-    first, key = (*model._columns(like), model.base_steps_like(like)), model.step_key()
-    assert model._columns(like.double())[1].dtype == torch.float64
-    assert all(a is b for a, b in zip(first, (*model._columns(like), model.base_steps_like(like)), strict=True))
+    first = model.base_steps_like(like)
+    assert model.base_steps_like(like.double()).dtype == torch.float64
+    assert model.base_steps_like(like) is first
     model.base_steps = (2.0, 0.001, 0.2)
     assert model.base_steps_like(like).tolist() == pytest.approx([2.0, 0.001, 0.2])
-    assert model.step_key() != key

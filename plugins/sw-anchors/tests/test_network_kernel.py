@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
-from sw_anchors import view_networks
 from sw_anchors.anchors import two_layers
+from sw_anchors.fast import networks as fast_networks
+from sw_anchors.fast.networks import fits_kernel, network_outputs, parameters_of
 from sw_anchors.native import ANCHORS
-from sw_anchors.view_networks import fit_kernel, network_outputs, parameters_of
 
 ON_CUDA = ANCHORS.available(cuda=True)
 pytestmark = [pytest.mark.cuda, pytest.mark.skipif(ON_CUDA is not None, reason=str(ON_CUDA))]
@@ -49,10 +49,10 @@ def test_outputs_and_gradients_are_those_of_torch(count, features, hidden, offse
     found = []
     for kernel in (True, False):
         if not kernel:
-            monkeypatch.setattr(view_networks, "fit_kernel", lambda *_: False)
+            monkeypatch.setattr(fast_networks, "fits_kernel", lambda *_: False)
         whole = values.clone().requires_grad_()
         own = whole[:, :features]  # columns of a matrix, as in training
-        assert fit_kernel(positions, own, parameters_of(networks)) or not kernel
+        assert fits_kernel(positions, own, parameters_of(networks)) or not kernel
         outputs = network_outputs(center, positions, own, networks)
         grads = torch.autograd.grad(outputs, [whole, *parameters_of(networks)], slopes)
         assert all(grad.data_ptr() % 16 == 0 for grad in grads if grad.numel())  # as the optimizer's kernel asks
@@ -65,7 +65,7 @@ def test_outputs_and_gradients_are_those_of_torch(count, features, hidden, offse
 def test_gradients_are_the_same_each_time():
     networks, center, positions, values, slopes = drawn(20_000, 50, 50, 10)
     own, parameters = values[:, :50].requires_grad_(), parameters_of(networks)
-    assert fit_kernel(positions, own, parameters)
+    assert fits_kernel(positions, own, parameters)
     found = [
         torch.autograd.grad(network_outputs(center, positions, own, networks), [own, *parameters], slopes)
         for _ in range(2)
@@ -77,5 +77,5 @@ def test_networks_that_do_not_fit_are_computed_by_torch():
     for features, hidden, offsets in ((52, 50, 10), (50, 52, 10), (50, 50, 12)):
         networks, center, positions, values, _ = drawn(5, features, hidden, offsets)
         own = values[:, :features]
-        assert not fit_kernel(positions, own, parameters_of(networks))
+        assert not fits_kernel(positions, own, parameters_of(networks))
         assert network_outputs(center, positions, own, networks)[1].shape == (5, 7 * offsets)

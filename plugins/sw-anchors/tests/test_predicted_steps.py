@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from sw_anchors.predicted_steps import predicted_steps
+from sw_anchors.fast.predicted_steps import predicted_steps
 
 
 def found_by(leaves, base, bounds, slopes):

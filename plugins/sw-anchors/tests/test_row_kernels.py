@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
-from sw_anchors import fused_ops
-from sw_anchors.fused_ops import add_rows, load_rows, noisy_rows, put_rows, sample_bits, take_rows
+from sw_anchors import rate_model
+from sw_anchors.fast import rows as fast_rows
+from sw_anchors.fast import sample_bits
+from sw_anchors.fast.rows import add_rows, load_rows, noisy_rows, put_rows, take_rows
 from sw_anchors.native import ANCHORS
 
 ON_CUDA = ANCHORS.available(cuda=True)
@@ -20,7 +22,7 @@ def both_forms(monkeypatch):
         forms = []
         for kernels in (True, False):
             if not kernels:
-                monkeypatch.setattr(fused_ops, "fit_kernels", lambda *_: False)
+                monkeypatch.setattr(fast_rows, "fit_kernels", lambda *_: False)
             forms.append(function())
         for one, other in zip(*forms, strict=True):
             limit = tolerance * float(other.abs().max()) if other.numel() else 0.0
@@ -91,19 +93,21 @@ def test_noisy_rows_and_their_gradients_are_those_of_torch(both_forms, features,
 
 
 @pytest.mark.parametrize(("count", "features", "k"), [(500, 50, 10), (1, 50, 10), (33, 7, 1), (0, 50, 10)])
-def test_bits_of_a_sample_and_their_gradients_are_those_of_torch(both_forms, count, features, k):
+def test_bits_of_a_sample_and_their_gradients_are_those_of_torch(count, features, k):
     draw, numbers = drawer(3), features + 6 + 3 * k
     x, mean = 3 * draw(count, numbers), 3 * draw(count, numbers)
     scale = draw(count, numbers)  # half of them below the floor
     steps, counted = draw(count, 3).abs() + 0.05, (draw(count) > -0.5).float()
     masks = (draw(count, k) > -0.5).float()
 
-    def compute():
+    found = []
+    for form in (sample_bits, rate_model):
         leaves = [each.detach().clone().requires_grad_() for each in (x, mean, scale, steps, masks)]
-        bits, by_group = sample_bits(*leaves, counted, p_min=1e-6, smallest_scale=1e-9)
-        return [bits.detach(), by_group, *torch.autograd.grad(0.5 * bits, leaves)]
-
-    both_forms(compute, 1e-4)
+        bits, by_group = form.bits_of(*leaves, counted, 1e-6, 1e-9)
+        found.append([bits.detach(), by_group, *torch.autograd.grad(0.5 * bits, leaves)])
+    for one, other in zip(*found, strict=True):
+        limit = 1e-4 * float(other.abs().max()) if other.numel() else 0.0
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=limit + 1e-9)
 
 
 def test_rows_are_added_where_they_are_named(both_forms):

@@ -2,7 +2,8 @@
 
 import pytest
 import torch
-from sw_anchors.fused_ops import sample_bits
+from sw_anchors import rate_model
+from sw_anchors.fast import sample_bits
 from sw_anchors.noisy_values import draws
 
 
@@ -19,7 +20,8 @@ def inputs(count, features, k, spread=1.0):
 def found_by(tensors, counted, dtype, smallest_scale=0.4):
     """float64 has no kernel."""
     leaves = [t.to(dtype).requires_grad_() for t in tensors]
-    bits, by_group = sample_bits(*leaves, counted.to(dtype), p_min=1e-6, smallest_scale=smallest_scale)
+    form = sample_bits if sample_bits.fits(*leaves) else rate_model
+    bits, by_group = form.bits_of(*leaves, counted.to(dtype), 1e-6, smallest_scale)
     return [bits.detach(), by_group, *torch.autograd.grad(0.5 * bits, leaves)]
 
 

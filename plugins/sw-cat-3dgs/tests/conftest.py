@@ -1,5 +1,7 @@
 """A trained little scene that the tests of the package share."""
 
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -14,6 +16,8 @@ from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
 from splatwizard_core.streams import stream
 from sw_cat_3dgs.config import CatConfig
 from sw_cat_3dgs.method import Cat3DGS
+
+sys.path.insert(0, str(Path(__file__).parent))  # for plane_lists
 
 SMALL = {
     "feature_dim": 8,

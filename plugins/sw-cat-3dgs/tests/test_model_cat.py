@@ -184,8 +184,8 @@ def test_what_training_forecasts_for_a_sample_is_what_is_predicted(begun, values
     learned = [p for name, p in model.context.named_parameters() if not name.startswith("arms")]
     noisy = torch.cat(model.raw(rows), dim=1).detach()
     context = model.refine(model.predict(rows), noisy[:, : model.features.shape[1]])
-    forecast = model.forecast(rows)
-    mean, scale = forecast.sample(drawn, forecast.hidden[drawn], noisy[drawn])
+    forecast = model.rate_model.forecast(model.context_of(rows), drawn)
+    mean, scale = model.rate_model.read(forecast, noisy[drawn])
     expected = [torch.cat(parts, dim=1) for parts in (context.steps, context.means, context.scales)]
     expected = [expected[0], expected[1][drawn], expected[2][drawn]]
     found = [forecast.steps, mean, scale]

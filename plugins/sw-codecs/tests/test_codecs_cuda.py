@@ -4,10 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from sw_codecs.context.channel_ar import ChannelAr
-from sw_codecs.context.hash_grid import MixedHashGrid
-from sw_codecs.context.spatial_ar import SpatialAr
-from sw_codecs.context.triplane import Triplane
 from sw_codecs.entropy import rates
 from sw_codecs.entropy.categorical import Categorical, CategoricalContext
 from sw_codecs.positions.ordering import spatial_order
@@ -52,36 +48,3 @@ def test_a_file_from_parameters_on_a_gpu_decodes_without_one():
     trained = CategoricalContext(7, n=3000, logits=torch.randn(7, device="cuda"))
     assert Categorical().bits(torch.from_numpy(few).cuda(), trained).is_cuda
     assert np.array_equal(Categorical().decode(Categorical().encode(few, trained), CategoricalContext(7, n=3000)), few)
-
-
-def _models():
-    """Context models with learned-looking weights, and what each computes of fixed inputs on its device."""
-    draw = torch.Generator().manual_seed(2)
-    x = torch.rand(500, 3, generator=draw)
-    places = torch.randint(0, 1 << 20, (500, 3), generator=draw)
-    values, noise = torch.randn(500, 9, generator=draw), [torch.rand(3, 2, n, n, generator=draw) for n in (5, 9)]
-    arms = torch.nn.ModuleList(SpatialAr(draw) for _ in range(3))
-    made = [
-        (MixedHashGrid([6, 9, 40], [9, 80], log2_space=9, log2_planes=8, generator=draw),
-         lambda m, d: m.at_places(m.places(x.to(d)))),
-        (Triplane(6, 4, generator=draw), lambda m, d: (m(places.to(d), rounded=True),)),
-        (arms, lambda m, d: (SpatialAr.joint_bits(list(m), [8 * n.to(d) for n in noise]),)),
-        (ChannelAr((2, 3, 4), generator=draw), lambda m, d: m(*[values.to(d)] * 3)),
-    ]  # fmt: skip
-    with torch.no_grad():
-        for model, _ in made:
-            for parameter in model.parameters():
-                parameter.add_(torch.randn(parameter.shape, generator=draw) * 0.3)
-    return made
-
-
-@pytest.mark.parametrize("which", range(4))
-def test_context_models_and_their_gradients_agree(which):
-    found = []
-    for device in ("cpu", "cuda"):
-        model, compute = _models()[which]
-        outputs = compute(model.to(device), device)
-        sum((o * o).mean() for o in outputs).backward()
-        found.append([t.detach().cpu() for t in (*outputs, *(p.grad for p in model.parameters()))])
-    for a, b in zip(*found, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-4 * float(a.abs().max()))

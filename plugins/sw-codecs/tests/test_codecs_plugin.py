@@ -25,7 +25,7 @@ NAMES = {
         "conditional-gaussian",
         "conditional-mixture",
     },
-    "context_models": {"hash-grid", "integer-mlp", "triplane", "spatial-ar", "channel-ar", "channel-mixture"},
+    "context_models": {"integer-mlp"},
     "coders": {
         "range",
         "rans",

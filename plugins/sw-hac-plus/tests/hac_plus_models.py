@@ -7,17 +7,17 @@ from sw_anchors.attribute_sections import AttributeEncoder
 from sw_anchors.coded_anchors import ENTROPY
 from sw_anchors.sections import round_networks
 from sw_anchors.shape import GROUPS
-from sw_anchors.voxel_lattice import kept_voxels
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.runs.config import apply_overrides
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene
-from sw_codecs.entropy.conditional_mixture import RowMixture
+from sw_codecs.entropy.rows import RowMixture
 from sw_hac_plus import codec
 from sw_hac_plus.config import HACPlusConfig
 from sw_hac_plus.method import HACPlus
 from sw_hac_plus.model import HACPlusAnchors
+from sw_hac_plus.voxel_lattice import kept_voxels
 
 PLUGINS = load_plugins()
 SMALL = {
@@ -81,7 +81,7 @@ class Recorder(AttributeEncoder):
         symbols = super().code(block, context, step, present)
         self.found[block.group].append((symbols * step).to(torch.float32))
         mixed = isinstance(context, RowMixture)
-        coder = self.mixtures if mixed else self.coder
+        coder = self.further.get(type(context), self.coder)
         self.mixed += [(symbols, context)] if mixed else []
         self.bits += float(coder.bits(symbols, context, present).sum())
         return symbols
@@ -93,9 +93,10 @@ def recorded(model, mode="exact"):
     model.fold_units()
     round_networks(model.networks(), "float32")
     geometry, rows = kept_voxels(model)
-    recorder = Recorder(model, rows, codec.sections(model.channel), mode)
+    further = codec.mixtures(model.channel, mode, PLUGINS)
+    recorder = Recorder(model, rows, codec.sections(model.channel), mode, PLUGINS, further)
     with torch.no_grad():
-        codec.Walk(mode, model.grid, model.mlp_grid, model.channel, model.shape, model.base_steps)(recorder, geometry)
+        codec.walk(recorder, model.rate_model.predictor(mode), model.channel, geometry)
     return recorder, geometry
 
 

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from sw_anchors.sections import BOUNDS_BYTES
 from sw_anchors.shape import GROUPS
 from sw_anchors.testing import check_without_kernels
-from sw_anchors.voxel_lattice import kept_voxels
 from sw_kit.forged_files import forged
 from sw_reference.rasterizer import ReferenceRasterizer
 from sw_reference.testing.raster_scenes import front_camera
@@ -20,8 +19,9 @@ from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import BitstreamError, SceneError
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene
-from sw_hac_plus import codec, predictors
+from sw_hac_plus import codec, rate_model
 from sw_hac_plus.method import HACPlus
+from sw_hac_plus.voxel_lattice import kept_voxels
 
 RASTERIZER = ReferenceRasterizer()
 FEATURES = ["features.1", "features.2", "features.3"]
@@ -30,10 +30,10 @@ KINDS = ["full", "tiny", "none"]
 
 
 def test_the_header_lists_what_decoding_needs():
-    writer = ContainerWriter("hac-plus", 1)
-    with torch.no_grad():
-        codec.encode(make(n=20), writer, method().config.codec.settings)
-    assert set(writer.required) == {
+    writer, made = ContainerWriter("hac-plus", 1), method()
+    with torch.no_grad(), made.plugins.recording() as loaded:
+        codec.encode(make(n=20), writer, made.config.codec.settings, made.plugins)
+    assert {*((entry.kind, entry.name) for entry in loaded), *writer.required} == {
         ("coder", "octree"), ("entropy model", "bernoulli"), ("context model", "integer-mlp"),
         ("context model", "channel-mixture"), ("entropy model", "conditional-mixture"),
         ("entropy model", "conditional-gaussian"),
@@ -101,12 +101,27 @@ def test_channel_networks_are_evaluated_a_few_rows_at_a_time(mode, limit, monkey
         return plain(self, index, known, context)
 
     monkeypatch.setattr(type(channel), "slice", counted)
-    monkeypatch.setattr(predictors, limit, 600)
+    monkeypatch.setattr(rate_model, limit, 600)
     found, _ = recorded(model, mode)
     assert len(seen) > len(FEATURES)
     assert max(seen) <= 600
     for group in GROUPS:
         assert torch.allclose(torch.cat(found.found[group], dim=1), torch.cat(whole.found[group], dim=1))
+
+
+@pytest.mark.parametrize("kind", ["full", "tiny", "none"])
+def test_the_rate_of_training_is_the_size_of_the_file(kind):
+    """The rate model that training minimises, of the very values that the file holds."""
+    model = make(n=6000, channel__kind=kind)
+    recorder, _ = recorded(model)
+    _, rows = kept_voxels(model)
+    values = torch.cat([part for group in GROUPS for part in recorder.found[group]], dim=1)
+    with torch.no_grad():
+        forecast = model.rate_model.forecast(model.context_of(rows), slice(0, None))
+        bits, _ = model.rate_model.rate(values, forecast, model.masks(rows), torch.ones(len(rows)))
+    sections = ContainerReader(encoded(model)).sections
+    size = 8 * sum(sections[name] for name in codec.sections(model.channel))
+    assert float(bits) == pytest.approx(size, rel=0.02)
 
 
 def test_decoding_leaves_the_global_generator_alone():

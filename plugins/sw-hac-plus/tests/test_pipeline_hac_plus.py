@@ -12,6 +12,7 @@ from splatwizard_core.method import create_method
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.training.pipeline import TrainingStopped
 from sw_codecs.entropy.rates import mixture_bits
+from sw_codecs.entropy.rows import RowMixture
 
 pytestmark = pytest.mark.pipeline
 
@@ -109,7 +110,7 @@ def test_the_file_is_as_small_as_the_mixtures_of_a_trained_model_ask_for(trained
             p_min=1e-12,
         )
         estimate += float(bits.sum())
-        tables += float(recorder.mixtures.bits(symbols, context).sum())
+        tables += float(recorder.further[RowMixture].bits(symbols, context).sum())
     assert estimate < tables < 1.002 * estimate
     sections = ContainerReader(file_of(made, model)).sections
     size = 8 * sum(sections[name] for name in ("features.1", "features.2"))

@@ -6,18 +6,17 @@ from types import SimpleNamespace
 import torch
 from sw_anchors.attribute_sections import AttributeEncoder
 from sw_anchors.coded_anchors import ENTROPY
-from sw_anchors.grid_anchors import GridAnchors
-from sw_anchors.grid_predictors import PREDICTORS
 from sw_anchors.sections import kept_geometry, round_networks
 from sw_anchors.shape import GROUPS
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.runs.config import apply_overrides
-from sw_codecs.context.hash_grid import MixedHashGrid
 from sw_hac import codec
 from sw_hac.config import HACConfig
 from sw_hac.method import HAC
+from sw_hac.mixed_grid import MixedHashGrid
+from sw_hac.model import HACAnchors
 
 PLUGINS = load_plugins()
 SMALL_GRID = {"features": 2, "log2_space": 8, "log2_planes": 8}
@@ -32,12 +31,12 @@ def method(**values) -> HAC:
     return HAC(PLUGINS, apply_overrides(HACConfig(), overrides, source="test"))
 
 
-def make(n: int = 300, feature_dim: int = 8, k: int = 4, *, seed: int = 0, **kwargs) -> GridAnchors:
+def make(n: int = 300, feature_dim: int = 8, k: int = 4, *, seed: int = 0, **kwargs) -> HACAnchors:
     """n anchors in front of the test camera; a fifth of the offsets, and anchors 0 to 4, are masked."""
     g = generator(seed)
     anchors = torch.rand(n, 3, generator=g) * 2 - torch.tensor([1.0, 1.0, -3.0])
     grid = MixedHashGrid((6, 10, 18), (10, 34), **SMALL_GRID, generator=g)
-    model = GridAnchors(
+    model = HACAnchors(
         anchors, torch.zeros(n, feature_dim), torch.zeros(n, k, 3), torch.zeros(n, 6), voxel_size=0.01, hidden=8,
         generator=g, grid=grid, grid_hidden=16, margin="extent", **kwargs,
     )  # fmt: skip
@@ -53,7 +52,7 @@ def make(n: int = 300, feature_dim: int = 8, k: int = 4, *, seed: int = 0, **kwa
         last.weight[-3:] *= 2
         last.weight[2 * feature_dim : 2 * feature_dim + 12] *= 0.02
         if n:
-            context = model.predict(torch.arange(n))
+            context = predicted(model, torch.arange(n))
             features, scales, offsets = (
                 mean + scale.clamp(min=1e-9) * torch.randn(mean.shape, generator=g)
                 for mean, scale in zip(context.means, context.scales, strict=True)
@@ -67,7 +66,12 @@ def make(n: int = 300, feature_dim: int = 8, k: int = 4, *, seed: int = 0, **kwa
     return model.eval()
 
 
-def encoded(model: GridAnchors, **values) -> bytes:
+def predicted(model, rows):
+    """Distributions of the anchors `rows`."""
+    return model.rate_model.predict(*model.context_of(rows))
+
+
+def encoded(model: HACAnchors, **values) -> bytes:
     writer = ContainerWriter("hac", HAC.version)
     with torch.no_grad():
         method(**values).encode(model, writer)
@@ -95,7 +99,7 @@ class Recorder(AttributeEncoder):
 
 
 def predictor(model, mode="exact"):
-    return PREDICTORS[mode](model.grid, model.mlp_grid, model.shape, model.base_steps)
+    return model.rate_model.predictor(mode)
 
 
 def lattice_of(model, *, mode="exact", **values):
@@ -103,12 +107,12 @@ def lattice_of(model, *, mode="exact", **values):
     settings = method(codec__settings__mode=mode, **values).config.codec.settings
     writer, again = ContainerWriter("hac", 1), ContainerWriter("hac", 1)
     with torch.no_grad():
-        codec.encode(model, writer, settings)
+        codec.encode(model, writer, settings, PLUGINS)
         model = copy.deepcopy(model)
         model.fold_units()
         round_networks(model.networks(), settings.weights)
         geometry, rows = kept_geometry(model)
-        recorder = Recorder(model, rows, list(codec.SECTIONS.values()), mode)
+        recorder = Recorder(model, rows, list(codec.SECTIONS.values()), mode, PLUGINS)
         codec.walk(recorder, predictor(model, mode), geometry)
         recorder.write(again)
     stored = ContainerReader(writer.to_bytes()), ContainerReader(again.to_bytes())

@@ -1,5 +1,6 @@
 """The file of HAC: exact integers on any machine, counted in full, and safe against strangers."""
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -14,7 +15,6 @@ from hypothesis import strategies as st
 from sw_anchors.attribute_sections import ExactNetwork
 from sw_anchors.decoded_anchors import DecodedAnchors
 from sw_anchors.float_mode import this_machine
-from sw_anchors.grid_predictors import PREDICTORS
 from sw_anchors.sections import morton_order
 from sw_anchors.shape import GROUPS
 from sw_anchors.testing import check_without_kernels
@@ -28,8 +28,8 @@ from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.runs import measure
 from splatwizard_core.runs.session import Session
 from splatwizard_core.scene.scene import Protocol
-from sw_codecs.entropy.conditional import RowContext
-from sw_codecs.entropy.lattice import RowLattice, lattice
+from sw_codecs.entropy.lattice import lattice
+from sw_codecs.entropy.rows import RowContext, RowLattice
 from sw_hac import codec
 from sw_hac.method import HAC
 
@@ -38,12 +38,13 @@ SECTIONS = ["anchors", "masks", "grids", "networks", "features", "scalings", "of
 
 
 def test_the_header_lists_what_decoding_needs():
-    writer = ContainerWriter("hac", 1)
-    codec.encode(make(n=20), writer, method().config.codec.settings)
-    assert list(dict.fromkeys(writer.required)) == [
+    writer, made = ContainerWriter("hac", 1), method()
+    with made.plugins.recording() as loaded:
+        codec.encode(make(n=20), writer, made.config.codec.settings, made.plugins)
+    assert {*((entry.kind, entry.name) for entry in loaded), *writer.required} == {
         ("coder", "octree"), ("entropy model", "bernoulli"), ("context model", "integer-mlp"),
         ("entropy model", "conditional-gaussian"),
-    ]  # fmt: skip
+    }  # fmt: skip
 
 
 def test_a_file_has_a_section_for_everything():
@@ -410,10 +411,10 @@ def test_a_wide_grid_is_looked_up_a_few_anchors_at_a_time(mode, monkeypatch):
     limit = 20 * grid.corners
     for where, name in (
         ("sw_anchors.attribute_sections", "EXACT_NUMBERS"),
-        ("sw_anchors.grid_predictors", "FLOAT_NUMBERS"),
+        ("sw_hac.rate_model", "FLOAT_NUMBERS"),
     ):
         monkeypatch.setattr(f"{where}.{name}", limit)
-    found = PREDICTORS[mode](grid, model.mlp_grid, model.shape, model.base_steps)(model.codes())
+    found = dataclasses.replace(model.rate_model, grid=grid).predictor(mode)(model.codes())
     assert 0 < max(grid.numbers) <= limit
     for group in GROUPS:
         for field in ("centre", "number", "step") if mode == "exact" else ("mean", "scale", "step"):

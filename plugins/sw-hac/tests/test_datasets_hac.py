@@ -3,7 +3,7 @@
 import pytest
 from click.testing import CliRunner
 from hac_models import PLUGINS
-from sw_anchors.dataset_values import RANDOM_START
+from sw_anchors.params import RANDOM_START
 from sw_datasets.families import BENCHMARKS
 from sw_datasets.rules import rules_for
 

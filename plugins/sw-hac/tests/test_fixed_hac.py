@@ -6,13 +6,15 @@ from contextlib import nullcontext
 import pytest
 import torch
 from hac_models import make
-from sw_anchors.coded_anchors import ENTROPY, FULL, QUANTIZED
-from sw_anchors.fixed_decoder import FixedDecoder
-from sw_anchors.fixed_step import FixedRows, sample_capacity, sample_of
-from sw_anchors.grid_anchors import GridAnchors
-from sw_anchors.seen_rows import ExpectedRows, SeenRows, capacity_of
-from sw_anchors.testing import check_fixed_decoder
+from sw_anchors.coded_anchors import ENTROPY, FULL, QUANTIZED, CodedAnchors
+from sw_anchors.fast import replay
+from sw_anchors.fast.fixed_step import FixedRows, sample_capacity, sample_of
+from sw_anchors.fast.replay import FixedDecoder
+from sw_anchors.fast.seen_rows import ExpectedRows, SeenRows, capacity_of
+from sw_anchors.testing import check_plain, check_replayed
 from sw_reference.testing.raster_scenes import front_camera
+
+from sw_hac.model import HACAnchors
 
 N = 330
 
@@ -25,26 +27,42 @@ def trained(device="cpu"):
     return model.requires_grad_(True)
 
 
+def replayed(model, graphs=False):
+    """Let the steps of a model be replayed, on any device."""
+    fixed = replay.DECODERS[model] = FixedDecoder(graphs=graphs)
+    return fixed
+
+
+def decoded(model, rows, camera=None):
+    """The Gaussians of the anchors `rows`, replayed where a training step is."""
+    camera = camera or front_camera().to(model.device)
+    if not replay.fits(model, CodedAnchors):
+        return model.decode(camera, rows)
+    found = replay.DECODERS[model].decode(model, camera, SeenRows(rows))
+    return model.decode(camera, rows) if found is None else found
+
+
+def test_the_fast_forms_change_neither_values_nor_gradients():
+    check_plain(trained, front_camera(), counts=(0, 1, 120, N))
+
+
 def test_fixed_sizes_change_neither_values_nor_gradients():
-    check_fixed_decoder(trained, front_camera(), counts=(0, 1, 120, 255, N))
+    check_replayed(trained, front_camera(), counts=(0, 1, 120, 255, N))
 
 
-@pytest.mark.parametrize("kept", [True, False])
-def test_without_a_kernel_for_the_grid_it_is_the_same(kept, monkeypatch):
-    monkeypatch.setattr("sw_codecs.context.hash_grid.signs_fit_kernel", lambda *_: False)
-    monkeypatch.setattr("sw_anchors.grid_anchors.PLACES_LIMIT", 1 << 30 if kept else 0)
-    assert len(trained().context_rows()) == (4 if kept else 1)
-    check_fixed_decoder(trained, front_camera(), counts=(90,), phases=(ENTROPY,))
+def test_without_a_kernel_for_the_grid_it_is_the_same(monkeypatch):
+    monkeypatch.setattr("sw_hac.fast.sign_lookup.fits", lambda *_: False)
+    check_replayed(trained, front_camera(), counts=(90,), phases=(ENTROPY,))
 
 
 def test_what_stood_beyond_the_count_does_not_matter():
     model = trained().train()
-    model.fixed, model.phase = FixedDecoder(graphs=False), FULL
+    fixed, model.phase = replayed(model), FULL
     images = []
     for before in (200, 3):
-        model.decode(front_camera(), torch.arange(before))
-        model.fixed._steps[256, 0].at.positions[100:].copy_(front_camera().center)  # where no direction is
-        found = model.decode(front_camera(), torch.arange(50, 90))
+        decoded(model, torch.arange(before))
+        fixed._steps[256, 0].at.positions[100:].copy_(front_camera().center)  # where no direction is
+        found = decoded(model, torch.arange(50, 90))
         found.means.sum().backward()
         images.append([found.opacities.detach().clone(), model.mlp_opacity[0].weight.grad.clone()])
         assert int(found.extras["anchors"].drawn.max()) < 40 * model.num_offsets
@@ -77,11 +95,11 @@ def test_more_drawn_than_a_sample_holds_are_left_out():
 
 def test_steps_are_prepared_once_for_a_capacity_and_anew_when_networks_or_phase_change():
     model = trained().train()
-    fixed = model.fixed = FixedDecoder(graphs=False)
+    fixed = replayed(model)
     model.phase = QUANTIZED
 
     def captures(count):
-        assert model.decode(front_camera(), torch.arange(count)) is not None
+        assert decoded(model, torch.arange(count)) is not None
         return fixed.captures
 
     assert [captures(10), captures(200), captures(255)] == [1, 1, 1]
@@ -122,7 +140,7 @@ def check_views_that_come_again(device, graphs):
     camera, model = front_camera().to(device), trained(device).train()
     plain = trained(device).train()
     model.phase = plain.phase = FULL  # without noise, whose draws depend on the places
-    fixed = model.fixed = FixedDecoder(graphs=graphs)
+    fixed = replayed(model, graphs)
     asked = []
     made = fixed.expected
     fixed.expected = lambda *args: asked.append(made(*args)) or asked[-1]
@@ -147,13 +165,13 @@ def test_a_view_that_comes_again_is_decoded_though_graphs_are_refused_by_then(se
         raise RuntimeError("out of memory")
 
     model, camera = trained().train(), front_camera()
-    model.phase, model.fixed = FULL, FixedDecoder(graphs=False)
+    model.phase, fixed = FULL, replayed(model)
     model.gaussians(camera, Seen(range(100)))
-    model.fixed._drop()
-    monkeypatch.setattr("sw_anchors.fixed_decoder.PlainStep", refuse)
-    assert model.fixed.expected(camera, N) == 256
+    fixed._drop()
+    monkeypatch.setattr("sw_anchors.fast.replay.PlainStep", refuse)
+    assert fixed.expected(camera, N) == 256
     assert sorted(model.gaussians(camera, Seen(range(seen))).extras["anchors"].rows.tolist()) == list(range(seen))
-    assert model.fixed.expected(camera, N) is None
+    assert fixed.expected(camera, N) is None
 
 
 @pytest.mark.parametrize("name", ["visible_anchors", "decode"])
@@ -162,36 +180,38 @@ def test_what_a_subclass_has_of_its_own_is_asked_for_views_that_come_again_too(n
 
     def own(self, *given):
         asked.append(given)
-        return getattr(GridAnchors, name)(self, *given)
+        return getattr(HACAnchors, name)(self, *given)
 
     model, camera = trained().train(), front_camera()
-    model.__class__, model.fixed = type("Own", (GridAnchors,), {name: own}), FixedDecoder(graphs=False)
+    model.__class__ = type("Own", (HACAnchors,), {name: own})
+    replayed(model)
     for _ in range(2):
         assert model.gaussians(camera, Seen(range(100))).extras["anchors"].rows.tolist() == list(range(100))
     assert len(asked) == 2
 
 
 def test_anchors_are_expected_in_proportion_to_how_many_there_are():
-    model, camera, fixed = trained().train(), front_camera(), FixedDecoder(graphs=False)
-    model.fixed = fixed
+    model, camera = trained().train(), front_camera()
+    fixed = replayed(model)
     assert fixed.expected(camera, 1000) is None
-    model.decode(camera, torch.arange(300))
+    decoded(model, torch.arange(300), camera)
     assert fixed.expected(camera, N) == capacity_of(312)
     assert fixed.expected(camera, 2 * N) == capacity_of(624)
     assert fixed.expected(front_camera(), N) is None  # another camera, though it stands there too
 
 
 def test_no_more_places_are_asked_for_than_all_anchors_need():
-    model, camera, fixed = trained().train(), front_camera(), FixedDecoder(graphs=False)
-    model.fixed = fixed
-    model.decode(camera, torch.arange(N))
+    model, camera = trained().train(), front_camera()
+    fixed = replayed(model)
+    decoded(model, torch.arange(N), camera)
     assert capacity_of(1030) > capacity_of(1000)
     assert fixed.expected(camera, 1000) == capacity_of(1000)
 
 
 def test_a_model_without_anchors_is_decoded_and_may_grow_again():
     model, camera = trained().train(), front_camera()
-    model.phase, model.fixed = FULL, FixedDecoder(graphs=False)
+    model.phase = FULL
+    replayed(model)
     rows = {name: getattr(model, name) for name in model.ROWS}
     model.gaussians(camera, Seen(range(10)))
 
@@ -240,12 +260,12 @@ def test_rows_that_are_known_and_those_that_are_found_answer_alike(seen):
 
 def test_random_draws_are_centred_and_new_at_each_step():
     model = trained().train()
-    model.fixed = FixedDecoder(graphs=False)
+    fixed = replayed(model)
     model.phase = QUANTIZED
     seen = []
     for _ in range(2):
-        model.decode(front_camera(), torch.arange(100))
-        at: FixedRows = model.fixed._steps[256, 0].at
+        decoded(model, torch.arange(100))
+        at: FixedRows = fixed._steps[256, 0].at
         seen.append(at.random.clone())
         assert float(at.random.abs().max()) <= 0.5
         assert abs(float(at.random.mean())) < 0.02
@@ -254,8 +274,8 @@ def test_random_draws_are_centred_and_new_at_each_step():
 
 def test_a_copy_and_evaluation_leave_the_fixed_sizes_alone():
     model = trained().train()
-    fixed = model.fixed = FixedDecoder(graphs=False)
-    assert copy.deepcopy(model).fixed is None
+    fixed = replayed(model)
+    assert copy.deepcopy(model) not in replay.DECODERS
     model.eval().decode(front_camera(), torch.arange(10))
     with torch.no_grad():
         model.train().decode(front_camera(), torch.arange(10))
@@ -267,39 +287,39 @@ def test_a_gpu_that_refuses_graphs_is_named_once_and_training_goes_on(kind, monk
     def refuse(*_):
         raise kind("operation not permitted\nand more")
 
-    monkeypatch.setattr("sw_anchors.fixed_decoder.CapturedStep", refuse)
+    monkeypatch.setattr("sw_anchors.fast.replay.CapturedStep", refuse)
     monkeypatch.setattr(torch.cuda, "graph_pool_handle", lambda: (0, 0))
     monkeypatch.setattr(torch.cuda, "device", lambda _: nullcontext())
     model = trained().train()
-    model.fixed, model.sample = FixedDecoder(), 1.0
+    fixed, model.sample = replayed(model, graphs=True), 1.0
     for _ in range(2):
-        found = model.decode(front_camera(), torch.arange(30))
+        found = decoded(model, torch.arange(30))
         assert found.extras["rate"].bits.requires_grad
     assert caplog.messages == ["training goes on without CUDA graphs, slower: operation not permitted"]
-    assert model.fixed._rows_held("positions") == 0
+    assert fixed._rows_held("positions") == 0
 
 
 @pytest.mark.cuda
 def test_graphs_change_neither_values_nor_gradients():
     camera = front_camera().to("cuda")
-    check_fixed_decoder(lambda: trained("cuda"), camera, counts=(0, 1, 120, 255, 256, 50, N), graphs=True)
+    check_replayed(lambda: trained("cuda"), camera, counts=(0, 1, 120, 255, 256, 50, N), graphs=True)
 
 
 @pytest.mark.cuda
 def test_graphs_are_made_anew_when_networks_or_phase_change():
-    camera, model = front_camera().to("cuda"), trained("cuda").train()
-    fixed = model.fixed = FixedDecoder()
+    model = trained("cuda").train()
+    fixed = replayed(model, graphs=True)
     rows = torch.arange(100, device="cuda")
     model.phase = ENTROPY
-    first = model.decode(camera, rows).extras["rate"].own_bits.item()
-    assert model.decode(camera, rows[:50]).extras["rate"].own_bits.item() == first
+    first = decoded(model, rows).extras["rate"].own_bits.item()
+    assert decoded(model, rows[:50]).extras["rate"].own_bits.item() == first
     assert fixed.captures == 1
     with torch.no_grad():
         model.grid.grids[0].table = torch.nn.Parameter(-model.grid.grids[0].table.abs())
-    assert model.decode(camera, rows).extras["rate"].own_bits.item() != first
+    assert decoded(model, rows).extras["rate"].own_bits.item() != first
     assert fixed.captures == 2
     model.phase = QUANTIZED
-    assert "rate" not in model.decode(camera, rows).extras
+    assert "rate" not in decoded(model, rows).extras
     assert (fixed.captures, fixed._failed) == (3, False)
 
 

@@ -4,7 +4,7 @@ import copy
 
 import pytest
 import torch
-from hac_models import generator, make, method
+from hac_models import generator, make, method, predicted
 from sw_anchors.coded_anchors import ENTROPY
 from sw_anchors.testing import check_nothing_is_waited_for
 from sw_reference.rasterizer import ReferenceRasterizer
@@ -47,7 +47,7 @@ def test_predictions_equal_the_formulas():
     torch.testing.assert_close(u, (model.positions()[rows] - model.bounds[0]) / box, atol=1e-5, rtol=0)
     out = model.mlp_grid(model.grid(u))
     mu_f, sigma_f, mu_l, sigma_l, mu_o, sigma_o, t_f, t_l, t_o = out.split([8, 8, 6, 6, 12, 12, 1, 1, 1], dim=1)
-    found = model.predict(rows)
+    found = predicted(model, rows)
     for mean, expected in zip(found.means, (mu_f, mu_l, mu_o), strict=True):
         torch.testing.assert_close(mean, expected)
     for scale, expected in zip(found.scales, (sigma_f, sigma_l, sigma_o), strict=True):
@@ -60,7 +60,7 @@ def test_steps_never_vanish():
     model = make()
     with torch.no_grad():
         model.mlp_grid[2].bias[-3:] = -40
-    for step, base in zip(model.predict(torch.arange(300)).steps, model.base_steps, strict=True):
+    for step, base in zip(predicted(model, torch.arange(300)).steps, model.base_steps, strict=True):
         torch.testing.assert_close(step, torch.full_like(step, base / 64))
 
 
@@ -116,7 +116,7 @@ def test_prediction_may_start_from_statistics():
     model = make(n=500)
     kept = torch.nonzero(model.kept()).squeeze(1)
     model.start_from_statistics()
-    found, values = model.predict(kept), model.raw(kept)
+    found, values = predicted(model, kept), model.raw(kept)
     for mean, scale, value, base in zip(found.means, found.scales, values, model.base_steps, strict=True):
         torch.testing.assert_close(mean.mean(0), value.mean(0), atol=0.1 * float(value.detach().std()), rtol=0.1)
         torch.testing.assert_close(scale.mean(0), value.std(0).clamp(min=base), atol=0.05, rtol=0.2)
@@ -124,12 +124,12 @@ def test_prediction_may_start_from_statistics():
 
 def test_predictions_in_steps_are_the_same_once_folded():
     model, rows = make(in_steps=True), torch.arange(40)
-    before = model.predict(rows)
+    before = predicted(model, rows)
     out = model.mlp_grid(model.grid(model.codes()[rows] / 65535))
     torch.testing.assert_close(before.means[1], out[:, 16:22] * 0.001)
     torch.testing.assert_close(before.scales[2], out[:, 40:52] * 0.2)
     model.fold_units()
-    after = model.predict(rows)
+    after = predicted(model, rows)
     for name in ("means", "scales", "steps"):
         for one, other in zip(getattr(before, name), getattr(after, name), strict=True):
             torch.testing.assert_close(one, other)
@@ -145,22 +145,24 @@ def test_the_state_of_grid_and_network_is_part_of_the_digest():
 
 
 @pytest.mark.parametrize("in_steps", [True, False])
-@pytest.mark.parametrize(("kernel", "kept"), [(True, False), (False, True), (False, False)])
-def test_what_training_forecasts_for_a_sample_is_what_is_predicted(in_steps, kernel, kept, monkeypatch):
+@pytest.mark.parametrize("kernel", [True, False])
+def test_what_training_forecasts_for_a_sample_is_what_is_predicted(in_steps, kernel, monkeypatch):
     if not kernel:
-        monkeypatch.setattr("sw_codecs.context.hash_grid.signs_fit_kernel", lambda *_: False)
-    monkeypatch.setattr("sw_anchors.grid_anchors.PLACES_LIMIT", 1 << 30 if kept else 0)
+        monkeypatch.setattr("sw_hac.fast.sign_lookup.fits", lambda *_: False)
     model = make(in_steps=in_steps)
     rows, drawn = torch.tensor([7, 3, 250, 20]), torch.tensor([3, 1])
     parameters = [*model.mlp_grid.parameters(), *model.grid.parameters()]
-    context, forecast = model.predict(rows), model.forecast(rows)
-    mean, scale = forecast.sample(drawn, forecast.hidden[drawn], torch.zeros(2, 26))
-    expected = [torch.cat(parts, dim=1) for parts in (context.steps, context.means, context.scales)]
-    expected = [expected[0], expected[1][drawn], expected[2][drawn], context.own_bits]
-    found = [forecast.steps, mean, scale, forecast.own_bits]
+    context, forecast = predicted(model, rows), model.rate_model.forecast(model.context_of(rows), drawn)
+    sampled = model.rate_model.read(forecast.outputs)
+    own_bits = model.grid.with_bits(*model.context_of(rows))[1]
+    steps = torch.cat(context.steps, dim=1)
+    expected = [torch.cat(parts, dim=1)[drawn] for parts in (context.means, context.scales)]
+    expected = [steps, steps[drawn], *expected, own_bits]
+    found = [torch.cat(parts, dim=1) for parts in (sampled.means, sampled.scales)]
+    found = [forecast.steps, forecast.sample_steps, *found, forecast.own_bits]
     for a, b in zip(found, expected, strict=True):
         torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-5)
-    gradients = [torch.autograd.grad(sum(part.square().sum() for part in each[:3]) + each[3], parameters)
+    gradients = [torch.autograd.grad(sum(part.square().sum() for part in each[:4]) + each[4], parameters)
                  for each in (found, expected)]  # fmt: skip
     for a, b in zip(*gradients, strict=True):
         torch.testing.assert_close(a, b, atol=1e-4, rtol=1e-4)
@@ -174,7 +176,7 @@ def test_on_a_gpu_neither_values_nor_rate_are_waited_for():
 
 def test_a_copy_leaves_behind_where_anchors_lie():
     model = make(40)
-    model.predict(torch.arange(4))
+    predicted(model, torch.arange(4))
     assert model._places is not None
     twin = copy.deepcopy(model)
     assert twin._places is None

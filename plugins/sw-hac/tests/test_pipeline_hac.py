@@ -95,7 +95,7 @@ def test_estimates_of_a_trained_model_are_its_size(trained):
     try:
         with torch.no_grad():
             sampled = [float(model.attributes(rows).extras["rate"].bits) for _ in range(40)]
-            grids = float(model.predict(rows[:1]).own_bits)
+            grids = float(model.grid.with_bits(*model.context_of(rows[:1]))[1])
     finally:
         model.eval()
     assert sum(sampled) / 40 * numbers == pytest.approx(size, rel=0.03)

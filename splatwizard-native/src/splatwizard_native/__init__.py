@@ -63,6 +63,7 @@ if TYPE_CHECKING:
     from splatwizard_native.scalars import Verdict as Verdict
     from splatwizard_native.scalars import read_scalars as read_scalars
     from splatwizard_native.settings import cache_root as cache_root
+    from splatwizard_native.settings import fast_enabled as fast_enabled
     from splatwizard_native.strict_json import dump_strict as dump_strict
     from splatwizard_native.strict_json import json_reason as json_reason
     from splatwizard_native.strict_json import load_strict as load_strict
@@ -96,7 +97,7 @@ MODULES = {
     "progress": "Bar duration track",
     "random_states": "capture_random_states one_order_of_sums preserved_random_states restore_random_states seeded",
     "scalars": "Verdict read_scalars",
-    "settings": "cache_root",
+    "settings": "cache_root fast_enabled",
     "strict_json": "dump_strict json_reason load_strict",
     "toolchain": "find_compiler",
     "work_clock": "loading_time work_time",

@@ -1,4 +1,4 @@
-"""Settings from the environment: the cache folder, the switch, and the longest wait for another process."""
+"""Settings from the environment: the cache folder, the switches, and the longest wait for another process."""
 
 from __future__ import annotations
 
@@ -25,6 +25,11 @@ def cache_root() -> Path:
 def switched_off() -> bool:
     """Whether $SPLATWIZARD_NATIVE asks to do without native code."""
     return os.environ.get("SPLATWIZARD_NATIVE", "1").strip().lower() in ("0", "off", "no", "false")
+
+
+def fast_enabled() -> bool:
+    """Whether functions in `fast/` folders stand in for the plain ones, to the same result: unless $SW_FAST is 0."""
+    return os.environ.get("SW_FAST", "1").strip().lower() not in ("0", "off", "no", "false")
 
 
 def build_timeout() -> float:

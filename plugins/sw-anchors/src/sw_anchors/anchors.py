@@ -21,7 +21,8 @@ from splatwizard_core.api import (
     ShapeError,
     SplatModel,
 )
-from sw_anchors.neural_gaussians import GEOMETRY, spawn
+from sw_anchors.fast import spawn as fast_spawn
+from sw_anchors.neural_gaussians import GEOMETRY, NeuralGaussians, spawn
 from sw_anchors.shape import AnchorShape
 from sw_codecs.context.two_layers import two_layers
 
@@ -81,8 +82,6 @@ class AnchorSplats(SplatModel):
 
     ROW_LABEL = "anchors"
     NETWORKS: tuple[str, ...] = ("mlp_opacity", "mlp_cov", "mlp_color")
-    COUNTS_MASKED = False
-    """Whether statistics see the opacity that a masked Gaussian would have."""
 
     mlp_opacity: nn.Sequential
     mlp_cov: nn.Sequential
@@ -158,18 +157,21 @@ class AnchorSplats(SplatModel):
     def decode(self, camera: Camera, rows: Tensor) -> GaussianInputs:
         """The Gaussians of the anchors `rows` [V] as `camera` sees them; those of opacity <= 0 are left out."""
         a = self.attributes(rows)
-        found = spawn(
-            camera.center.to(a.positions), a.positions, a.features, a.offsets, a.scales, a.masks,
-            (self.mlp_opacity, self.mlp_cov, self.mlp_color),
-        )  # fmt: skip
-        seen = found.alphas if self.COUNTS_MASKED else found.all_opacities
+        given = (camera.center.to(a.positions), a.positions, a.features, a.offsets, a.scales, a.masks)
+        decode = fast_spawn.spawn if fast_spawn.fits(*given[1:]) else spawn
+        return self.drawn(rows, decode(*given, (self.mlp_opacity, self.mlp_cov, self.mlp_color)), a.masks, a.extras)
+
+    def drawn(
+        self, rows: Tensor, found: NeuralGaussians, masks: Tensor | None, extras: dict[str, Any]
+    ) -> GaussianInputs:
+        """The Gaussians that were spawned by the anchors `rows` [V], with their `masks` [V or more, k], as inputs."""
         return GaussianInputs(
             means=found.means,
             opacities=found.opacities,
             scales=found.scales,
             quats=found.quats,
             colors=found.colors,
-            extras={**a.extras, "anchors": AnchorSelection(rows, seen, found.drawn)},
+            extras={**extras, "anchors": AnchorSelection(rows, found.all_opacities[: len(rows)], found.drawn)},
         )
 
 

@@ -1,4 +1,4 @@
-"""Sections of an anchor file that hold attributes: integers, block by block of anchors, under predicted Gaussians.
+"""Sections of an anchor file that hold attributes: integers, block by block of anchors, as a rate model predicts them.
 
 A method writes down once how it walks over the rows, predicting each block of integers from what is known by then. The
 walk hands them to an `AttributeEncoder`, which rounds the values of a model and codes them, or to an
@@ -8,7 +8,7 @@ walk hands them to an `AttributeEncoder`, which rounds the values of a model and
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -18,17 +18,20 @@ from splatwizard_core.api import BitstreamError
 from sw_anchors.row_parts import EXACT_NUMBERS, parts_of
 from sw_anchors.shape import GROUPS, AnchorShape
 from sw_codecs.context.integer_mlp import FRACTION, IntegerMlp
-from sw_codecs.entropy.conditional import ConditionalGaussian, RowContext
-from sw_codecs.entropy.conditional_mixture import ConditionalMixture, RowMixture
-from sw_codecs.entropy.exact_tables import exact_tables
-from sw_codecs.entropy.lattice import RowLattice
+from sw_codecs.entropy.exact_tables import exact_tables, step_multipliers
+from sw_codecs.entropy.rows import RowContext, RowLattice
 from sw_codecs.exact_native import EXACT
 from sw_codecs.quantizers.rounding import SteRound
 
 if TYPE_CHECKING:
-    from splatwizard_core.api import ContainerReader, ContainerWriter
+    from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager
     from sw_anchors.coded_anchors import CodedAnchors
     from sw_anchors.decoded_anchors import DecodedAnchors
+    from sw_codecs.entropy.conditional import ConditionalGaussian
+
+
+Coders = Mapping[type, Any]
+"""Type of a context -> the entropy model that takes it, with `encode` and `decode`."""
 
 
 class Block(NamedTuple):
@@ -46,18 +49,21 @@ class AttributeCoder:
     rows        the blocks of rows that a walk goes over, in order
     """
 
-    def __init__(self, count: int, shape: AnchorShape, mode: str) -> None:
-        """Of `count` anchors, in mode "exact" or "float" of the entropy model `conditional-gaussian`."""
-        self.coder = ConditionalGaussian(mode)
-        self.mixtures = ConditionalMixture(mode)
+    def __init__(
+        self, count: int, shape: AnchorShape, mode: str, plugins: PluginManager, further: Coders | None = None
+    ) -> None:
+        """Of `count` anchors, in mode "exact" or "float" of the entropy model `conditional-gaussian`.
+
+        further     entropy models for other contexts than its own
+        """
+        self.coder: ConditionalGaussian = plugins.entropy_models.load("conditional-gaussian")(mode)
+        self.further = further or {}
         self.rows = self.coder.blocks(count, max(shape.widths))
 
-    def code(
-        self, block: Block, context: RowContext | RowLattice | RowMixture, step: Tensor, present: Tensor | None = None
-    ) -> Tensor:
+    def code(self, block: Block, context: Any, step: Tensor, present: Tensor | None = None) -> Tensor:
         """Code one block; its integers [n,C] int64, 0 where they are not in the file.
 
-        context     distributions of its numbers, in the units of the mode
+        context     distributions of its numbers in the units of the mode: RowContext, RowLattice, or a `further` one
         step        [n,1] float64, quantiser steps in units of the values
         present     [n,C] bool: numbers that are in the file; None: all
         """
@@ -67,29 +73,31 @@ class AttributeCoder:
 class AttributeEncoder(AttributeCoder):
     """Rounds the attributes of a model's anchors `rows` [N] (their order in the file) and codes them."""
 
-    def __init__(self, model: CodedAnchors, rows: Tensor, sections: Sequence[str], mode: str) -> None:
-        super().__init__(len(rows), model.shape, mode)
+    def __init__(
+        self,
+        model: CodedAnchors,
+        rows: Tensor,
+        sections: Sequence[str],
+        mode: str,
+        plugins: PluginManager,
+        further: Coders | None = None,
+    ) -> None:
+        super().__init__(len(rows), model.shape, mode, plugins, further)
         self._values = dict(zip(GROUPS, (v.detach().cpu() for v in model.raw(rows)), strict=True))
         self._centres = dict(zip(GROUPS, (c.cpu() for c in model.centres()), strict=True))
         self._coded: dict[str, list[bytes]] = {name: [] for name in sections}
         self._round = SteRound()
 
-    def code(
-        self, block: Block, context: RowContext | RowLattice | RowMixture, step: Tensor, present: Tensor | None = None
-    ) -> Tensor:
+    def code(self, block: Block, context: Any, step: Tensor, present: Tensor | None = None) -> Tensor:
         values = self._values[block.group][block.rows, block.columns].double()
         symbols, _ = self._round.encode(values, step, mean=self._centres[block.group])
         symbols = symbols if present is None else symbols * present
-        if isinstance(context, RowMixture):
-            coded = self.mixtures.encode(symbols.numpy(), context, present)
-        else:
-            coded = self.coder.encode(symbols.numpy(), context, present)
-        self._coded[block.section].append(coded)
+        coder = self.further.get(type(context), self.coder)
+        self._coded[block.section].append(coder.encode(symbols.numpy(), context, present))
         return symbols
 
     def write(self, writer: ContainerWriter) -> None:
         """Add all sections, after the walk."""
-        writer.require("entropy model", "conditional-gaussian")
         for name, blocks in self._coded.items():
             writer.add(name, self.coder.join(blocks))
 
@@ -97,10 +105,18 @@ class AttributeEncoder(AttributeCoder):
 class AttributeDecoder(AttributeCoder):
     """Reads what an AttributeEncoder wrote into a DecodedAnchors; errors name the section."""
 
-    def __init__(self, reader: ContainerReader, model: DecodedAnchors, sections: Sequence[str], mode: str) -> None:
+    def __init__(
+        self,
+        reader: ContainerReader,
+        model: DecodedAnchors,
+        sections: Sequence[str],
+        mode: str,
+        plugins: PluginManager,
+        further: Coders | None = None,
+    ) -> None:
         """Raises BitstreamError if a section is missing."""
         shape = AnchorShape(model.features.shape[1], model.num_offsets)
-        super().__init__(model.num_rows, shape, mode)
+        super().__init__(model.num_rows, shape, mode, plugins, further)
         self._reader = reader
         found = (model.features.data, model.scales.data, model.offsets.data.view(-1, shape.widths[2]))
         self._found = dict(zip(GROUPS, found, strict=True))
@@ -108,16 +124,14 @@ class AttributeDecoder(AttributeCoder):
             name: self.coder.split(reader.section(name), len(self.rows)) for name in sections
         }
 
-    def code(
-        self, block: Block, context: RowContext | RowLattice | RowMixture, step: Tensor, present: Tensor | None = None
-    ) -> Tensor:
+    def code(self, block: Block, context: Any, step: Tensor, present: Tensor | None = None) -> Tensor:
         """Raises BitstreamError for damage."""
         with self._reader.decoding(block.section):
             data = next(self._coded[block.section])
             values = self._found[block.group][block.rows, block.columns]
-            if not isinstance(context, RowMixture):
+            if type(context) not in self.further:
                 return self.coder.decode_into(values, data, context, step, present)
-            symbols = torch.from_numpy(self.mixtures.decode(data, context, present))
+            symbols = torch.from_numpy(self.further[type(context)].decode(data, context, present))
             values.copy_(symbols * step)
         return symbols
 
@@ -205,7 +219,7 @@ class ExactNetwork:
     def read(self, outputs: Tensor) -> dict[str, RowContext]:
         """Distributions by group that outputs [n, sum(shape.outputs)] stand for."""
         parts = torch.split(outputs, self._shape.outputs, dim=1)
-        multipliers = torch.from_numpy(ConditionalGaussian.step_multipliers(parts[6], self._step_offset))
+        multipliers = torch.from_numpy(step_multipliers(parts[6].numpy()) + self._step_offset)
         return {
             group: RowContext(parts[2 * i], parts[2 * i + 1], multipliers[:, i : i + 1])
             for i, group in enumerate(GROUPS)

@@ -6,6 +6,7 @@ Source: Scaffold-GS (arXiv 2312.00109) as used by HAC (arXiv 2403.14530), follow
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from splatwizard_core.api import EmptyModel, SplatOptimizer
 from sw_anchors.anchors import AnchorModel, AnchorSelection
-from sw_anchors.fused_ops import add_rows
+from sw_anchors.fast import rows as fast_rows
 
 MAX_LOG_BASE_SCALE = 0.05
 """Logarithms of the base scales (columns 3 to 5) above this are lowered to it at every adjustment."""
@@ -41,10 +42,17 @@ def accumulate_anchor_statistics(
     # Every index occurs once, and what was not drawn adds 0: a mask as an index would be waited for on a GPU.
     rows, seen = selection.rows, (radii > 0).to(model.offset_denom)
     sums = selection.opacities.clamp(min=0).sum(dim=1), model.anchor_denom.new_ones(len(rows))
-    add_rows(rows, sums, (model.opacity_accum, model.anchor_denom))
+    add = fast_rows.add_rows if fast_rows.fit_kernels(model.opacity_accum) else add_rows
+    add(rows, sums, (model.opacity_accum, model.anchor_denom))
     norms = torch.linalg.vector_norm(gradients, dim=1).to(model.offset_grad_accum)
     totals = model.offset_grad_accum.view(-1), model.offset_denom.view(-1)
-    add_rows(selection.offset_index(), (norms.masked_fill_(seen == 0, 0), seen), totals)
+    add(selection.offset_index(), (norms.masked_fill_(seen == 0, 0), seen), totals)
+
+
+def add_rows(rows: Tensor, sources: Sequence[Tensor], into: Sequence[Tensor]) -> None:
+    """Add row i of each source [V,...] to row rows[i] (int64) of its target."""
+    for source, target in zip(sources, into, strict=True):
+        target.index_add_(0, rows, source)
 
 
 @torch.no_grad()

@@ -10,6 +10,18 @@ from sw_gaussians.pictures import Pictures
 
 from splatwizard_core.api import OptimizationParams, Params, SameResult
 
+RANDOM_START: Mapping[str, Any] = {
+    "init_points": 100_000,
+    "paired_offsets": True,
+    "random_background_until": 1_500,
+    "lr.mlp_opacity_early": 0.1,
+}
+"""Start of scenes in the Blender layout, which as a rule come without points (docs/methods/hac.md).
+
+The authors of HAC draw 10,000 points where the folder holds none of an earlier 3DGS training, and take its 100,000
+where it does; their figures are those of the latter.
+"""
+
 
 class AnchorLearningRates(Params):
     """Adam step sizes; from `init` to `final` exponentially over `max_steps`."""

@@ -18,11 +18,10 @@ from torch import Tensor, nn
 
 from splatwizard_core.api import BitstreamError
 from sw_anchors.lattice import BITS, TOP, coded_positions
-from sw_codecs.entropy.bernoulli import Bernoulli
-from sw_codecs.positions.octree import Octree
+from sw_codecs.positions.morton import interleave
 
 if TYPE_CHECKING:
-    from splatwizard_core.api import ContainerReader, ContainerWriter
+    from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager
     from sw_anchors.coded_anchors import CodedAnchors
 
 WeightType = Literal["float32", "float16"]
@@ -51,7 +50,7 @@ class AnchorGeometry:
 
 def morton_order(codes: Tensor) -> Tensor:
     """[N] int64: the order of rows in the file, for position codes [N,3]."""
-    return torch.from_numpy(np.ascontiguousarray(Octree.sort(codes.cpu().numpy())))
+    return torch.argsort(interleave(codes.cpu()), stable=True)
 
 
 def kept_geometry(model: CodedAnchors) -> tuple[AnchorGeometry, Tensor]:
@@ -62,23 +61,21 @@ def kept_geometry(model: CodedAnchors) -> tuple[AnchorGeometry, Tensor]:
     return geometry, rows
 
 
-def add_geometry(writer: ContainerWriter, geometry: AnchorGeometry) -> None:
+def add_geometry(writer: ContainerWriter, geometry: AnchorGeometry, plugins: PluginManager) -> None:
     """Add the sections `anchors` and `masks`, and the header values num_anchors, num_gaussians and num_offsets."""
-    writer.require("coder", "octree")
     bounds = geometry.bounds.numpy().astype("<f4").tobytes()
-    writer.add("anchors", bounds + Octree().encode(geometry.codes.numpy(), BITS))
-    add_masks(writer, geometry.masks)
+    writer.add("anchors", bounds + plugins.position_codecs.load("octree")().encode(geometry.codes.numpy(), BITS))
+    add_masks(writer, geometry.masks, plugins)
 
 
-def add_masks(writer: ContainerWriter, masks: Tensor) -> None:
+def add_masks(writer: ContainerWriter, masks: Tensor, plugins: PluginManager) -> None:
     """Add the section `masks` and the header values num_anchors, num_gaussians and num_offsets; masks [N,k] bool."""
     writer.static["num_anchors"], writer.static["num_offsets"] = map(int, masks.shape)
     writer.static["num_gaussians"] = int(masks.sum())
-    writer.require("entropy model", "bernoulli")
-    writer.add("masks", Bernoulli().encode(masks.numpy().reshape(-1)))
+    writer.add("masks", plugins.entropy_models.load("bernoulli")().encode(masks.numpy().reshape(-1), None))
 
 
-def read_geometry(reader: ContainerReader, *, bytes_per_anchor: int) -> AnchorGeometry:
+def read_geometry(reader: ContainerReader, plugins: PluginManager, *, bytes_per_anchor: int) -> AnchorGeometry:
     """Inverse of `add_geometry`.
 
     bytes_per_anchor    of the decoded model, held against the size of the file before anything is allocated
@@ -88,12 +85,12 @@ def read_geometry(reader: ContainerReader, *, bytes_per_anchor: int) -> AnchorGe
     n, k, gaussians = read_counts(reader, bytes_per_anchor=bytes_per_anchor)
     with reader.decoding("anchors") as data:
         bounds = read_bounds(data)
-        codes = torch.from_numpy(Octree(max_points=n).decode(data[BOUNDS_BYTES:]))
+        codes = torch.from_numpy(plugins.position_codecs.load("octree")(max_points=n).decode(data[BOUNDS_BYTES:]))
         if codes.shape != (n, 3):
             raise BitstreamError(f"holds {len(codes):,} anchors, header says {n:,}")
         if n and not 0 <= int(codes.min()) <= int(codes.max()) <= TOP:
             raise BitstreamError(f"an anchor leaves the lattice of {BITS} bits")
-    return AnchorGeometry(bounds, codes, read_masks(reader, n, k, gaussians))
+    return AnchorGeometry(bounds, codes, read_masks(reader, plugins, n, k, gaussians))
 
 
 def read_counts(reader: ContainerReader, *, bytes_per_anchor: int) -> tuple[int, int, int]:
@@ -115,10 +112,10 @@ def read_bounds(data: bytes | memoryview) -> Tensor:
     return bounds
 
 
-def read_masks(reader: ContainerReader, n: int, k: int, gaussians: int) -> Tensor:
+def read_masks(reader: ContainerReader, plugins: PluginManager, n: int, k: int, gaussians: int) -> Tensor:
     """[n,k] bool from the section `masks`, `gaussians` of them set, at least one a row. Raises BitstreamError."""
     with reader.decoding("masks") as data:
-        symbols = Bernoulli().decode(data, n * k)
+        symbols = plugins.entropy_models.load("bernoulli")().decode(data, n * k)
         masks = torch.from_numpy(symbols.reshape(n, k) > 0)
         if int(masks.sum()) != gaussians:
             raise BitstreamError(f"keeps {int(masks.sum()):,} Gaussians, header says {gaussians:,}")

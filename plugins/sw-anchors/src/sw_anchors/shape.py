@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
+from torch import Tensor
+
 GROUPS = ("features", "scales", "offsets")
 """Coded attributes of an anchor, [F], [6] (linear, world units) and [3k]; every triple is in this order."""
 
@@ -33,3 +36,17 @@ class AnchorShape:
     def decoded_bytes(self) -> int:
         """Bytes of one decoded anchor: position, groups and masks."""
         return 4 * (3 + sum(self.widths)) + self.offsets
+
+    def widened(self, steps: Tensor) -> Tensor:
+        """Return steps [V,3] of the groups for each of their numbers, [V, sum(widths)]; differentiable."""
+        parts = zip(steps.split(1, dim=1), self.widths, strict=True)
+        return torch.cat([step.expand(-1, width) for step, width in parts], dim=1)
+
+    def joined(self, features: Tensor, scales: Tensor, offsets: Tensor) -> Tensor:
+        """Return factors [S,1], [S,1] and [S,k] of the groups for each of their numbers, [S, sum(widths)]."""
+        threefold = offsets[:, :, None].expand(-1, -1, 3).flatten(1)
+        return torch.cat([features.expand(-1, self.features), scales.expand(-1, 6), threefold], dim=1)
+
+    def sums(self, numbers: Tensor) -> Tensor:
+        """Return the sum over each group of numbers [S, sum(widths)], [3]."""
+        return torch.stack([part.sum() for part in numbers.split(list(self.widths), dim=1)])

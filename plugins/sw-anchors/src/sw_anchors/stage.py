@@ -21,10 +21,11 @@ from splatwizard_core.api import (
     TaskLog,
     photometric_loss,
 )
+from splatwizard_native import fast_enabled
 from sw_anchors.anchors import AnchorModel
 from sw_anchors.coded_anchors import CodedAnchors
-from sw_anchors.fixed_decoder import FixedDecoder
-from sw_anchors.fused_ops import Weighted, mean_product, weighted_sum
+from sw_anchors.fast import loss as fast_loss
+from sw_anchors.fast import replay
 from sw_anchors.growth import accumulate_anchor_statistics, adjust_anchors
 from sw_anchors.params import AnchorParams, CodedAnchorParams
 
@@ -41,6 +42,10 @@ if TYPE_CHECKING:
         SplatModel,
         View,
     )
+
+
+Weighted = tuple[float, "Tensor"]
+"""Weight of a scalar in a sum, and the scalar."""
 
 
 class AnchorStage(Stage):
@@ -173,15 +178,28 @@ class AnchorStage(Stage):
     def mean_volume(self, result: RenderResult) -> Tensor:
         """Mean product of the scales of what is drawn, scalar; differentiable."""
         assert result.inputs.scales is not None
-        return mean_product(result.inputs.scales)
+        mean = fast_loss.mean_product if fast_enabled() else mean_product
+        return mean(result.inputs.scales)
 
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
         settings = self.opt.loss
         truth = view.image(background, result.image.device)
         found = photometric_loss(result.image, truth, lambda_dssim=settings.lambda_dssim)
         terms = {"volume": (settings.volume, self.mean_volume(result)), **self.extra_loss(model, result, step)}
-        total, *weighted = weighted_sum(found.total, *(t if isinstance(t, tuple) else (1.0, t) for t in terms.values()))
+        add_up = fast_loss.weighted_sum if fast_enabled() else weighted_sum
+        total, *weighted = add_up(found.total, *(t if isinstance(t, tuple) else (1.0, t) for t in terms.values()))
         return LossPack(total, found.parts | dict(zip(terms, weighted, strict=True)))
+
+
+def mean_product(scales: Tensor) -> Tensor:
+    """Mean over the rows of scales [M,3] of their product, 0 for none; a scalar, differentiable."""
+    return scales.prod(dim=1).sum() / max(len(scales), 1)
+
+
+def weighted_sum(start: Tensor, *terms: Weighted) -> tuple[Tensor, ...]:
+    """(start plus all terms times their weights; the weighted terms, without gradient); all of them scalars."""
+    weighted = [weight * term for weight, term in terms]
+    return start + sum(weighted), *(each.detach() for each in weighted)
 
 
 class CodedAnchorStage(AnchorStage):
@@ -193,20 +211,14 @@ class CodedAnchorStage(AnchorStage):
     opt: CodedAnchorParams
     trains = CodedAnchors
 
-    def __init__(self, opt: CodedAnchorParams) -> None:
-        super().__init__(opt)
-
     def begin(self, context: StageContext) -> SplatModel:
         model = super().begin(context)
         assert isinstance(model, CodedAnchors)
         model.noise = context.generator("noise")
-        fits = self.opt.graphs and model.HAS_FIXED_FORM and model.device.type == "cuda"
-        model.fixed = FixedDecoder() if fits else None
         return model
 
     def finish(self, model: SplatModel, scene: Scene) -> SplatModel:
-        assert isinstance(model, CodedAnchors)
-        model.fixed = None  # its graphs hold memory
+        replay.release(model)
         return super().finish(model, scene)
 
     def learning_rates(self, step: int) -> Mapping[str, float]:

@@ -1,7 +1,8 @@
-"""Checks for the tests of methods on anchors: decoding in tensors of fixed sizes, training without waiting for a GPU.
+"""Checks for the tests of methods on anchors: the fast forms of a training step against the plain one.
 
-def test_fixed_sizes_change_nothing():
-    check_fixed_decoder(make_model, camera, counts=(0, 1, 40))
+def test_fast_forms_change_nothing():
+    check_plain(make_model, camera, counts=(0, 1, 40))
+    check_replayed(make_model, camera, counts=(0, 1, 40))
 """
 
 from __future__ import annotations
@@ -16,18 +17,18 @@ from torch import Tensor
 from splatwizard_core.api import Camera
 from sw_anchors.coded_anchors import ENTROPY, FULL, QUANTIZED, CodedAnchors
 from sw_anchors.decoded_anchors import DecodedAnchors
-from sw_anchors.fixed_decoder import FixedDecoder
-from sw_anchors.fixed_step import FixedRows
-from sw_anchors.fused_ops import mean_product
+from sw_anchors.fast import fixed_step
+from sw_anchors.fast.fixed_step import FixedRows, PoolRows
+from sw_anchors.fast.replay import FixedDecoder
+from sw_anchors.fast.seen_rows import SeenRows, capacity_of
 from sw_anchors.growth import accumulate_anchor_statistics
-from sw_anchors.pool_rows import PoolRows
-from sw_anchors.seen_rows import capacity_of
+from sw_anchors.stage import mean_product
 from sw_codecs.exact_native import EXACT
 
 PHASES = (FULL, QUANTIZED, ENTROPY)
 
 
-def check_fixed_decoder(
+def check_replayed(
     make: Callable[[], CodedAnchors],
     camera: Camera,
     *,
@@ -37,30 +38,48 @@ def check_fixed_decoder(
     sample: float = 0.3,
     tolerance: float = 1e-4,
 ) -> None:
-    """Raise AssertionError unless values, rate, gradients and statistics are the same, for counts of visible anchors.
+    """Raise AssertionError unless a step in tensors of fixed sizes is the same, for counts of visible anchors.
 
     What is drawn of the Gaussians is left out: a rasterizer cuts them off, and a rounding decides on which side.
 
     make        the same model each time
     graphs      as CUDA graphs
-    tolerance   of each tensor, as a share of its largest value
+    tolerance   of values, rate, gradients and statistics, as a share of the largest value of each tensor
     """
     fixed = FixedDecoder(graphs=graphs)
     same = make()
     for phase in phases:
         for count in counts:
-            found = []
-            for decoder in (None, fixed):
-                # Graphs belong to one model; what a step changes is put back.
-                model = same if decoder is not None else make()
-                model.fixed = decoder
-                found.append(_one_step(model, camera, phase, count, sample))
-            for name in found[0].keys() | found[1].keys():
-                # A sample without an anchor: no gradient in one form, zeros in the other.
-                expected, got = (each.get(name, torch.zeros(())) for each in found)
-                limit = tolerance * max(float(expected.abs().amax()), 1e-6) if expected.numel() else 0.0
-                difference = float((expected - got).abs().amax()) if got.numel() else 0.0
-                assert difference <= limit, f"{phase}, {count} anchors, {name}: {difference:.3g} apart"
+            # Graphs belong to one model; what a step changes is put back.
+            expected = _one_step(make(), None, camera, phase, count, sample)
+            _compare(expected, _one_step(same, fixed, camera, phase, count, sample), phase, count, tolerance)
+
+
+def check_plain(
+    make: Callable[[], CodedAnchors],
+    camera: Camera,
+    *,
+    counts: Sequence[int],
+    phases: Sequence[str] = PHASES,
+    sample: float = 0.3,
+    tolerance: float = 1e-4,
+) -> None:
+    """Raise AssertionError unless a step with SW_FAST=0 is the same as with the fast forms; arguments as above."""
+    for phase in phases:
+        for count in counts:
+            found = _one_step(make(), None, camera, phase, count, sample)
+            with mock.patch.dict("os.environ", SW_FAST="0"):
+                expected = _one_step(make(), None, camera, phase, count, sample)
+            _compare(expected, found, phase, count, tolerance)
+
+
+def _compare(expected: dict[str, Tensor], found: dict[str, Tensor], phase: str, count: int, tolerance: float) -> None:
+    for name in expected.keys() | found.keys():
+        # A sample without an anchor: no gradient in one form, zeros in the other.
+        right, got = (each.get(name, torch.zeros(())) for each in (expected, found))
+        limit = tolerance * max(float(right.abs().amax()), 1e-6) if right.numel() else 0.0
+        difference = float((right - got).abs().amax()) if got.numel() else 0.0
+        assert difference <= limit, f"{phase}, {count} anchors, {name}: {difference:.3g} apart"
 
 
 def check_without_kernels(encoded: Callable[[], bytes], decoded: Callable[[bytes], DecodedAnchors]) -> None:
@@ -100,14 +119,16 @@ def check_nothing_is_waited_for(model: CodedAnchors) -> None:
     assert all(bool(torch.isfinite(p.grad).all()) for p in model.parameters() if p.grad is not None)
 
 
-def _one_step(model: CodedAnchors, camera: Camera, phase: str, count: int, sample: float) -> dict[str, Tensor]:
-    """Loss, rate, gradients by name and statistics of a step on `count` anchors, with the same draws in both forms."""
+def _one_step(
+    model: CodedAnchors, decoder: FixedDecoder | None, camera: Camera, phase: str, count: int, sample: float
+) -> dict[str, Tensor]:
+    """Loss, rate, gradients by name and statistics of a step on `count` anchors, with the same draws in all forms."""
     model.train().zero_grad()
     model.phase, model.sample = phase, sample
-    device, capacity = model.device, capacity_of(count)
+    device = model.device
     generator = torch.Generator().manual_seed(count)
     rows = torch.randperm(model.num_rows, generator=generator)[:count].sort().values.to(device)
-    capacity = max(capacity, capacity_of(model.num_rows))
+    capacity = max(capacity_of(count), capacity_of(model.num_rows))
     noise = torch.rand(capacity, sum(model.shape.widths), generator=generator).to(device)
     draws = torch.rand(capacity, generator=generator).to(device)
 
@@ -116,20 +137,20 @@ def _one_step(model: CodedAnchors, camera: Camera, phase: str, count: int, sampl
         parts = [noise[:count].flatten()] + ([draws[:count]] if isinstance(at, FixedRows) else [])
         at.random.copy_(torch.cat(parts) - 0.5)
 
-    def pool(size: int) -> tuple[Tensor, Tensor]:
-        drawn = torch.nonzero(draws[: model.num_rows] < sample).squeeze(1)
-        rest = drawn.new_full((size - len(drawn),), model.num_rows - 1)
-        return torch.cat([drawn, rest]), (torch.arange(size, device=device) < len(drawn)).to(noise)
+    def pool(uniform: Tensor, count: int, share: float) -> tuple[Tensor, Tensor]:
+        drawn = torch.nonzero(draws[:count] < share).squeeze(1)
+        rest = drawn.new_full((len(uniform) - len(drawn),), count - 1)
+        return torch.cat([drawn, rest]), (torch.arange(len(uniform), device=device) < len(drawn)).to(noise)
 
     with (
         mock.patch.object(FixedRows, "draw", fill),
         mock.patch.object(PoolRows, "draw", fill),
-        mock.patch.object(model, "pool_sample", pool),
-        mock.patch.object(model, "uniform", lambda *shape: noise[: shape[0]].clone()),
+        mock.patch.object(fixed_step, "bernoulli_rows", pool),
         mock.patch.object(model, "draw_noise", lambda *shape: noise[: shape[0]].clone()),
         mock.patch.object(model, "draw_sample", lambda n: torch.nonzero(draws[:n] < sample).squeeze(1)),
     ):
-        inputs = model.decode(camera, rows)
+        inputs = model.decode(camera, rows) if decoder is None else decoder.decode(model, camera, SeenRows(rows))
+    assert inputs is not None
     drawn = {name: t for name, t in inputs.tensors().items() if t.is_floating_point()}
     assert inputs.scales is not None
     found = {"volume": mean_product(inputs.scales)}

@@ -15,8 +15,8 @@ import torch
 from sw_anchors.attribute_sections import AttributeCoder, AttributeDecoder, AttributeEncoder, Block
 from sw_anchors.decoded_anchors import DecodedAnchors
 from sw_anchors.float_mode import add_machine, one_thread, read_mode
-from sw_anchors.forecasts import triple
 from sw_anchors.header import read_base_steps, read_integers
+from sw_anchors.rate_model import triple
 from sw_anchors.sections import (
     AnchorGeometry,
     add_geometry,
@@ -31,14 +31,13 @@ from torch import Tensor, nn
 from splatwizard_core.api import BitstreamError
 from sw_cat_3dgs.context import PLANES, CatContext, ContextShape
 from sw_cat_3dgs.model import CatAnchors
-from sw_cat_3dgs.predictors import PREDICTORS, Predictor
+from sw_cat_3dgs.rate_model import CatRateModel, Predictor
 from sw_cat_3dgs.stage import base_resolution
-from sw_codecs.context.spatial_ar import SpatialAr
-from sw_codecs.context.triplane import GAIN
-from sw_codecs.entropy.conditional import RowContext
+from sw_cat_3dgs.triplane import GAIN
+from sw_codecs.entropy.rows import RowContext
 
 if TYPE_CHECKING:
-    from splatwizard_core.api import ContainerReader, ContainerWriter
+    from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager
     from sw_cat_3dgs.config import CatConfig
 
 LIMITS = {
@@ -47,7 +46,7 @@ LIMITS = {
 }  # fmt: skip
 
 
-def encode(model: CatAnchors, writer: ContainerWriter, config: CatConfig) -> None:
+def encode(model: CatAnchors, writer: ContainerWriter, config: CatConfig, plugins: PluginManager) -> None:
     """Write all sections; the model stays as it is."""
     geometry, rows = kept_geometry(model)
     mode = config.codec.settings.mode
@@ -55,16 +54,18 @@ def encode(model: CatAnchors, writer: ContainerWriter, config: CatConfig) -> Non
     networks = {name: copy.deepcopy(getattr(model, name)).cpu() for name in model.NETWORKS} | _networks(context)
     round_networks(networks, config.codec.settings.weights)
     _write_shape(writer, context.shape, config, context.resolution)
-    add_geometry(writer, geometry)
+    add_geometry(writer, geometry, plugins)
     add_networks(writer, networks, config.codec.settings.weights)
     writer.add_array("frame", context.frame.numpy().astype("<f4"))
     planes = [plane.numpy() for plane in context.triplane.integers()]
     writer.require("context model", "spatial-ar")
-    writer.add("triplane", SpatialAr.encode(planes, [arm.exact(arm.state()) for arm in context.spatial_models]))
+    coder = plugins.entropy_models.load("wavefront")()
+    expected = coder.Context(context.exact_arms(), context.shape.planes(context.resolution))
+    writer.add("triplane", coder.encode(expected.join(planes), expected))
     _use_integers(context, planes)
 
-    attributes = AttributeEncoder(model, rows, sections(context.shape), mode)
-    predictor = PREDICTORS[mode](context)
+    attributes = AttributeEncoder(model, rows, sections(context.shape), mode, plugins)
+    predictor = CatRateModel.of_file(context).predictor(mode)
     if len(rows):
         with one_thread() if mode == "float" else torch.no_grad():
             walk(attributes, predictor, context.places(geometry.codes, geometry.bounds), geometry.masks)
@@ -74,7 +75,7 @@ def encode(model: CatAnchors, writer: ContainerWriter, config: CatConfig) -> Non
     writer.allow(decoded_bytes(len(rows), context.shape, context.resolution), f"a model of {len(rows):,} anchors")
 
 
-def decode(reader: ContainerReader) -> DecodedAnchors:
+def decode(reader: ContainerReader, plugins: PluginManager) -> DecodedAnchors:
     """Raises BitstreamError for damage, and for a file of mode `float` that another machine wrote."""
     mode = read_mode(reader)
     shape, hidden, resolution = _read_shape(reader)
@@ -82,20 +83,21 @@ def decode(reader: ContainerReader) -> DecodedAnchors:
     reader.allow(decoded_bytes(n, shape, resolution), f"a model of {n:,} anchors and planes of base {resolution}")
     if (n > 0) != (resolution > 0):
         raise BitstreamError(f"{reader.name}: header gives {n:,} anchors planes of {resolution}", section="header")
-    geometry = read_geometry(reader, bytes_per_anchor=shape.decoded_bytes)
+    geometry = read_geometry(reader, plugins, bytes_per_anchor=shape.decoded_bytes)
     model = DecodedAnchors.zeros(geometry, shape, hidden=hidden)
     context = CatContext(shape, torch.Generator())
     read_networks(reader, {name: getattr(model, name) for name in model.NETWORKS} | _networks(context))
     context.frame = torch.from_numpy(reader.array("frame", dtype="<f4", shape=(7, 3), finite=True))
     with reader.decoding("networks"):
-        arms = [arm.exact(arm.state()) for arm in context.spatial_models]
+        arms = context.exact_arms()
     with reader.decoding("triplane") as data:
-        shapes = [(shape.channels, m * resolution, m * resolution) for m in shape.multiples]
-        _use_integers(context, SpatialAr.decode(data, shapes, arms))
+        coder = plugins.entropy_models.load("wavefront")()
+        expected = coder.Context(arms, shape.planes(resolution))
+        _use_integers(context, expected.split(coder.decode(data, expected)))
     with reader.decoding("networks"):
-        predictor = PREDICTORS[mode](context)
+        predictor = CatRateModel.of_file(context).predictor(mode)
 
-    attributes = AttributeDecoder(reader, model, sections(shape), mode)
+    attributes = AttributeDecoder(reader, model, sections(shape), mode, plugins)
     if n:
         with reader.decoding("frame"):
             places = context.places(geometry.codes, geometry.bounds)
@@ -139,7 +141,7 @@ def sections(shape: ContextShape) -> list[str]:
 
 def decoded_bytes(anchors: int, shape: ContextShape, resolution: int) -> int:
     """Bytes of the model in float32, with the planes that its decoder holds meanwhile."""
-    latents = sum(PLANES * shape.channels * (m * resolution) ** 2 for m in shape.multiples)
+    latents = sum(PLANES * c * h * w for c, h, w in shape.planes(resolution))
     return anchors * shape.decoded_bytes + 4 * latents
 
 

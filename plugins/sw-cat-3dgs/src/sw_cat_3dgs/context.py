@@ -13,16 +13,18 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from sw_anchors.anchors import linear_layers
-from sw_anchors.forecasts import AnchorContext, AnchorForecast, Triple, triple
 from sw_anchors.lattice import low_and_step
-from sw_anchors.predicted_steps import predicted_steps
+from sw_anchors.rate_model import AnchorContext, Triple, triple
 from sw_anchors.shape import AnchorShape
 from torch import Tensor, nn
 
-from sw_codecs.context.channel_ar import ChannelAr
-from sw_codecs.context.principal_frame import PrincipalFrame
-from sw_codecs.context.spatial_ar import SpatialAr
-from sw_codecs.context.triplane import GAIN, PlaneSites, Triplane
+from splatwizard_native import fast_enabled
+from sw_cat_3dgs import spatial_ar
+from sw_cat_3dgs.channel_ar import ChannelAr
+from sw_cat_3dgs.fast import plane_bits, plane_sites, slices
+from sw_cat_3dgs.principal_frame import PrincipalFrame
+from sw_cat_3dgs.spatial_ar import ExactSpatialAr, SpatialAr
+from sw_cat_3dgs.triplane import GAIN, Triplane
 from sw_codecs.context.two_layers import two_layers
 from sw_codecs.quantizers.rounding import add_noise
 
@@ -47,6 +49,10 @@ class ContextShape(AnchorShape):
     refine: bool
     base_steps: tuple[float, float, float]
 
+    def planes(self, resolution: int) -> list[tuple[int, int, int]]:
+        """Channels, rows and columns of the planes of each scale, for a base resolution."""
+        return [(self.channels, m * resolution, m * resolution) for m in self.multiples]
+
 
 class CatContext(nn.Module):
     """Context model of all anchors.
@@ -59,6 +65,8 @@ class CatContext(nn.Module):
     rounded     planes are used (and trained) as the file will have them
     in_steps    the network gives means and scales as multiples of base steps, not in the units of the values
     """
+
+    step_offset = STEP_OFFSET
 
     frame: Tensor
     triplane: Triplane
@@ -87,6 +95,10 @@ class CatContext(nn.Module):
     def spatial_models(self) -> list[SpatialAr]:
         """The models `arms`, one for each plane orientation."""
         return [arm for arm in self.arms if isinstance(arm, SpatialAr)]
+
+    def exact_arms(self) -> list[ExactSpatialAr]:
+        """The spatial models in integers. Raises BitstreamError for weights that no exact evaluation takes."""
+        return [arm.exact(arm.state()) for arm in self.spatial_models]
 
     # Set-up
 
@@ -150,7 +162,8 @@ class CatContext(nn.Module):
 
     def outputs(self, places: Tensor) -> Tensor:
         """Outputs [V, sum(shape.outputs)] of the network for anchors at places [V,3]."""
-        found: Tensor = self.network(self.triplane(places, rounded=self.rounded))
+        look_up = plane_sites.look_up if plane_sites.fits(list(self.triplane.planes)) else Triplane.forward
+        found: Tensor = self.network(look_up(self.triplane, places, rounded=self.rounded))
         return found
 
     def read(self, outputs: Tensor) -> AnchorContext:
@@ -160,39 +173,15 @@ class CatContext(nn.Module):
         means, scales = ([out[2 * i + second] * unit for i, unit in enumerate(self.units)] for second in (0, 1))
         return AnchorContext(triple(means), triple(scales), triple(steps.split(1, dim=1)))
 
-    def forecast(self, sites: PlaneSites, base_steps: Tensor) -> AnchorForecast:
-        """Predict for training: V anchors at `sites` of the triplane; base_steps [3] of the shape.
-
-        All anchors have noise of their own steps; means and scales are computed for the sample alone.
-        """
-        first, last = linear_layers(self.network)
-        widths = self.shape.outputs[:-1]
-        weights = torch.split(last.weight, [sum(widths), PLANES])
-        biases = torch.split(last.bias, [sum(widths), PLANES])
-        features = self.triplane.at_sites(sites, rounded=self.rounded)
-        parameters = (first.weight, first.bias, weights[1], biases[1])
-        steps, hidden = predicted_steps(features, parameters, base_steps, offset=STEP_OFFSET)
-
-        def sample(drawn: Tensor, hidden: Tensor | None, values: Tensor) -> tuple[Tensor, Tensor]:
-            assert hidden is not None
-            out = torch.split(nn.functional.linear(hidden, weights[0], biases[0]), widths, dim=1)
-            if self.in_steps:
-                out = tuple(
-                    part * unit for part, unit in zip(out, (u for u in self.units for _ in (0, 1)), strict=True)
-                )
-            first, second = self._refined(out[0::2], out[1::2], values[:, : self.shape.features])
-            return torch.cat(first, dim=1), torch.cat(second, dim=1)
-
-        return AnchorForecast(steps, None, hidden, sample)
-
     def refine(self, context: AnchorContext, features: Tensor) -> AnchorContext:
         """Refine the context by features [V,F]: each slice by those before it."""
-        means, scales = self._refined(context.means, context.scales, features)
+        means, scales = self.refined(context.means, context.scales, features)
         return dataclasses.replace(context, means=means, scales=scales)
 
-    def _refined(self, means: Sequence[Tensor], scales: Sequence[Tensor], features: Tensor) -> tuple[Triple, Triple]:
-        """Refine means and scales of the groups."""
-        found = [self.slices(features, means[0], scales[0])]
+    def refined(self, means: Sequence[Tensor], scales: Sequence[Tensor], features: Tensor) -> tuple[Triple, Triple]:
+        """Refine means and scales of the groups by features [V,F]."""
+        refined = slices.refined if fast_enabled() else ChannelAr.forward
+        found = [refined(self.slices, features, means[0], scales[0])]
         for name, mean, scale in zip(("scales", "offsets"), means[1:], scales[1:], strict=True):
             found.append(self.slices.refine(name, features, mean, scale) if self.shape.refine else (mean, scale))
         first, second = zip(*found, strict=True)
@@ -209,5 +198,5 @@ class CatContext(nn.Module):
         chosen = torch.argsort(noise(channels))[:count] if count < channels else None
         planes = [plane if chosen is None else plane.index_select(1, chosen) for plane in self.triplane.planes]
         values = [add_noise(GAIN * plane, plane.new_ones(()), noise(*plane.shape)) for plane in planes]
-        total = SpatialAr.joint_bits(self.spatial_models, values)
-        return total * (channels / count)
+        bits = plane_bits.plane_bits if plane_bits.fits(values) else spatial_ar.plane_bits
+        return bits(self.spatial_models, values) * (channels / count)

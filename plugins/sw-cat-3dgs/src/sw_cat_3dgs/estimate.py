@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import torch
-from sw_anchors.forecasts import triple
+from sw_anchors.rate_model import triple
 
 from sw_codecs.entropy.rates import gaussian_bits
 from sw_codecs.quantizers.rounding import SteRound

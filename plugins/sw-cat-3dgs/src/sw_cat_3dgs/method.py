@@ -74,8 +74,8 @@ class Cat3DGS(Method):
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         if not isinstance(model, CatAnchors):
             raise TypeError(f"cat-3dgs encodes its own anchors, not a {type(model).__name__}")
-        codec.encode(model, writer, self.config)
+        codec.encode(model, writer, self.config, self.plugins)
 
     def decode(self, reader: ContainerReader) -> SplatModel:
         self.check_version(reader)
-        return codec.decode(reader)
+        return codec.decode(reader, self.plugins)

@@ -7,13 +7,14 @@ from typing import Any, Literal
 
 import torch
 from sw_anchors.coded_anchors import CodedAnchors
-from sw_anchors.forecasts import AnchorContext, AnchorForecast
+from sw_anchors.rate_model import AnchorContext, Context
 from torch import Tensor
 
 from splatwizard_core.api import Camera, Rasterizer
 from sw_cat_3dgs.context import STEP_OFFSET, CatContext
-from sw_cat_3dgs.plane_bits import FixedPlaneBits
-from sw_codecs.context.triplane import PlaneSites
+from sw_cat_3dgs.fast import plane_sites
+from sw_cat_3dgs.fast.plane_graphs import FixedPlaneBits
+from sw_cat_3dgs.rate_model import CatRateModel
 
 Trained = Literal["everything", "spatial models", "all but planes", "nothing"]
 
@@ -40,12 +41,13 @@ class CatAnchors(CodedAnchors):
         self.views_stale = True
         self.trained: Trained = "everything"
         self.register_buffer("view_weights", self.anchors.new_ones(len(self.anchors)))
-        self._places: tuple[tuple[Any, ...], Tensor, PlaneSites] | None = None
+        self._places: tuple[tuple[Any, ...], Tensor] | None = None
+        self._sites: tuple[Tensor, int, plane_sites.PlaneSites] | None = None
         self.fixed_planes: FixedPlaneBits | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """A copy works out anew where its anchors lie."""
-        return {**super().__getstate__(), "_places": None, "fixed_planes": None}
+        return {**self.__dict__, "_places": None, "_sites": None, "fixed_planes": None}
 
     def mask_weights(self) -> Tensor:
         return self.view_weights[:, None]
@@ -61,33 +63,31 @@ class CatAnchors(CodedAnchors):
 
     def places(self) -> Tensor:
         """[N,3] integer places of the anchors in the triplane, kept until anchors or frame are others."""
-        return self._kept_places()[0]
-
-    def _kept_places(self) -> tuple[Tensor, PlaneSites]:
-        """The places, and their sites on the planes."""
-        codes, context = self.codes(), self.context
-        key = (codes, context.frame, context.frame._version, context.resolution)
+        codes, frame = self.codes(), self.context.frame
+        key = (codes, frame, frame._version)
         kept = self._places
-        if kept is None or kept[0][0] is not key[0] or kept[0][1] is not key[1] or kept[0][2:] != key[2:]:
-            self._places = None  # the old ones go before the new ones come
-            places = context.places(codes, self.bounds)
-            kept = self._places = (key, places, context.triplane.sites(places))
-        return kept[1], kept[2]
+        if kept is None or kept[0][0] is not codes or kept[0][1] is not frame or kept[0][2] != key[2]:
+            kept = self._places = (key, self.context.places(codes, self.bounds))
+        return kept[1]
 
     def predict(self, rows: Tensor) -> AnchorContext:
         found: AnchorContext = self.context(self.places()[rows])
         return found
 
-    def context_rows(self) -> tuple[Tensor, ...]:
-        """The sites of the anchors on the planes."""
-        return self._kept_places()[1]
+    def context_rows(self) -> Context:
+        """The places of the anchors in the triplane; their sites on the planes, where `fast` takes these."""
+        planes = list(self.context.triplane.planes)
+        if not plane_sites.fits(planes):
+            return (self.places(),)
+        places = self.places()
+        if self._sites is None or self._sites[0] is not places or self._sites[1] != self.context.resolution:
+            self._sites = None  # the old ones go before the new ones come
+            self._sites = places, self.context.resolution, plane_sites.sites_of(planes, places)
+        return self._sites[2]
 
-    def forecast_at(self, parts: tuple[Tensor, ...]) -> AnchorForecast:
-        sites = PlaneSites(*parts)
-        return self.context.forecast(sites, self.base_steps_like(sites.weights))
-
-    def step_key(self) -> tuple[Any, ...]:
-        return *super().step_key(), self.context.rounded, self.context.in_steps
+    @property
+    def rate_model(self) -> CatRateModel:
+        return CatRateModel(self.context, self.base_steps_like(self.features), self.floors)
 
     def plane_bits(self, share: float) -> Tensor:
         """Estimate the bits of the planes from a share of their channels; differentiable."""

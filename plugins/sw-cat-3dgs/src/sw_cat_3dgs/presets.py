@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from sw_anchors.dataset_values import RANDOM_START
+from sw_anchors.params import RANDOM_START
 
 AUTHORS_VALUES: Mapping[str, Mapping[str, Any]] = {
     "tandt": {"voxel_size": 0.01},

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from sw_anchors.coded_anchors import ENTROPY, QUANTIZED
-from sw_anchors.fused_ops import Weighted
 from sw_anchors.phase_switch import PhaseSwitch
-from sw_anchors.stage import CodedAnchorStage
+from sw_anchors.stage import CodedAnchorStage, Weighted
 
 from splatwizard_core.api import CameraIterator, LossPack, Rasterizer, SplatOptimizer, TaskLog
+from splatwizard_native import fast_enabled
 from sw_cat_3dgs.config import FULL_RUN, CatConfig
+from sw_cat_3dgs.fast.plane_graphs import FixedPlaneBits
 from sw_cat_3dgs.model import CatAnchors, Trained
-from sw_cat_3dgs.plane_bits import FixedPlaneBits
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -47,7 +47,7 @@ class CatStage(CodedAnchorStage):
         self._cameras: list[Camera] | None = None
         model = super().begin(context)
         assert isinstance(model, CatAnchors)
-        model.fixed_planes = FixedPlaneBits() if model.fixed is not None else None
+        model.fixed_planes = FixedPlaneBits() if fast_enabled() and model.device.type == "cuda" else None
         return model
 
     def finish(self, model: SplatModel, scene: Scene) -> SplatModel:

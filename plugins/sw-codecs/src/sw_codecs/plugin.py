@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from splatwizard_core import api
     from sw_codecs.arrays import byte_planes, deflate, packed_bits
     from sw_codecs.coders import arithmetic, huffman
-    from sw_codecs.context import channel_ar, channel_mixture, hash_grid, integer_mlp, spatial_ar, triplane
+    from sw_codecs.context import integer_mlp
     from sw_codecs.entropy import (
         bernoulli,
         categorical,
@@ -43,8 +43,7 @@ if TYPE_CHECKING:
         conditional.ConditionalGaussian, conditional_mixture.ConditionalMixture,
     ]  # fmt: skip
     CONTEXT_MODELS: list[Callable[..., api.ContextModel]] = [
-        integer_mlp.IntegerMlp, triplane.Triplane, spatial_ar.SpatialAr, channel_ar.ChannelAr, hash_grid.MixedHashGrid,
-        channel_mixture.ChannelMixture,
+        integer_mlp.IntegerMlp,
     ]  # fmt: skip
     ENTROPY_CODERS: list[Callable[..., api.EntropyCoder]] = [
         arithmetic.RangeCoder, arithmetic.RansCoder, huffman.HuffmanCoder,
@@ -95,16 +94,6 @@ def register_entropy_models(registry: Registry[Any]) -> None:
 def register_context_models(registry: Registry[Any]) -> None:
     registry.add("integer-mlp", "sw_codecs.context.integer_mlp:IntegerMlp",
                  summary="ReLU network evaluated in exact integer arithmetic")  # fmt: skip
-    registry.add("triplane", "sw_codecs.context.triplane:Triplane",
-                 summary="features of a place from three planes at several scales; exact in integers")  # fmt: skip
-    registry.add("spatial-ar", "sw_codecs.context.spatial_ar:SpatialAr",
-                 summary="integers of a plane from their causal neighbours, coded along wavefronts")  # fmt: skip
-    registry.add("channel-ar", "sw_codecs.context.channel_ar:ChannelAr",
-                 summary="channels in slices, each from the slices before it")  # fmt: skip
-    registry.add("channel-mixture", "sw_codecs.context.channel_mixture:ChannelMixture",
-                 summary="a second Gaussian for each channel, from the slices before it")  # fmt: skip
-    registry.add("hash-grid", "sw_codecs.context.hash_grid:MixedHashGrid",
-                 summary="learned signs on grids of many resolutions, looked up by position")  # fmt: skip
 
 
 @hookimpl

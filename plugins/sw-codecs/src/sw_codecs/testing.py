@@ -9,7 +9,7 @@ Each takes what is registered and something to code, and raises AssertionError t
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -55,6 +55,37 @@ class EntropyCase:
     context: Any
     training: Any
     decoding: Any
+
+
+def check_damage(
+    data: bytes,
+    decode: Callable[[bytes], np.ndarray],
+    expected: np.ndarray,
+    *,
+    masks: Sequence[int] = (0x01, 0x80, 0xFF),
+    truncations: Iterable[int] | None = None,
+) -> None:
+    """Hold a decoder to this: cut data is refused, and data with one changed byte is refused or decodes right.
+
+    masks           each is applied to each byte by exclusive or
+    truncations     lengths to cut the data to; None: all
+    """
+    lengths = range(len(data)) if truncations is None else truncations
+    for cut in (*(data[:length] for length in lengths), data + b"\x00"):
+        try:
+            decode(cut)
+        except BitstreamError:
+            continue
+        raise AssertionError(f"{len(cut)} bytes of {len(data)} are decoded")
+    for i in range(len(data)):
+        for mask in masks:
+            changed = bytearray(data)
+            changed[i] ^= mask
+            try:
+                found = decode(bytes(changed))
+            except BitstreamError:
+                continue
+            _hold(np.array_equal(found, expected), f"byte {i} ^ {mask:#x} decodes to something else")
 
 
 def check_quantizer(

@@ -2,17 +2,12 @@
 
 import itertools
 
-import numpy as np
 import pytest
 import torch
 from torch import nn
 
-from splatwizard_core.errors import BitstreamError
-from sw_codecs.context.hash_grid import HashGrid, MixedHashGrid
+from sw_codecs.context.hash_grid import HashGrid
 from sw_codecs.context.integer_mlp import IntegerMlp
-from sw_codecs.context.spatial_ar import SpatialAr
-from sw_codecs.context.triplane import UNIT, Triplane
-from sw_codecs.entropy import exact_streams
 
 
 def generator(seed=0):
@@ -86,20 +81,6 @@ def test_a_leaky_network_of_inputs_side_by_side(leak, widths, kernels):
         assert torch.equal(made(*given), made(*small))
 
 
-@pytest.mark.parametrize("features", [1, 4, 6, 16])
-def test_a_mixed_hash_grid(features, kernels):
-    grid = MixedHashGrid(
-        (6, 18, 33, 9), (10, 130), features=features, log2_space=9, log2_planes=8, generator=generator()
-    )
-    codes = torch.randint(-3, 65_539, (500, 3), generator=generator(1))
-    codes[:4] = torch.tensor([[0, 0, 0], [65_535] * 3, [0, 65_535, 1], [65_536, 5, 5]])
-    ours, expected = both(kernels, lambda: grid.integer_features(codes))
-    assert torch.equal(ours, expected)
-    for short in both(kernels, lambda: grid.integer_features(codes, torch.int16)):
-        assert short.dtype == torch.int16
-        assert torch.equal(short.to(torch.int64), expected)
-
-
 def test_a_table_that_changed_is_looked_up_anew(kernels):
     grid = HashGrid.binary_grid(3, (6, 18), features=2, log2_size=9, generator=generator())
     codes = torch.randint(0, 65_536, (50, 3), generator=generator(1))
@@ -110,82 +91,3 @@ def test_a_table_that_changed_is_looked_up_anew(kernels):
     ours, expected = both(kernels, lambda: grid.integer_features(codes))
     assert not torch.equal(ours, before)
     assert torch.equal(ours, expected)
-
-
-@pytest.mark.parametrize("sizes", [(1, 2), (5,), (3, 6, 9, 12)])
-@pytest.mark.parametrize("channels", [1, 7, 8])
-def test_planes_are_sampled(sizes, channels, kernels):
-    drawn = [torch.randint(-(2**23), 2**23, (3, channels, r, r), generator=generator(r)) for r in sizes]
-    places = torch.randint(0, UNIT + 1, (300, 3), generator=generator())
-    places[:2] = torch.tensor([[0, UNIT, 0], [UNIT, UNIT, UNIT]])
-    ours, expected = both(kernels, lambda: Triplane.exact(drawn, places))
-    assert torch.equal(ours, expected)
-
-
-def spatial_models(count, scale=0.3):
-    found = []
-    for seed in range(count):
-        made = SpatialAr(generator(seed))
-        with torch.no_grad():
-            for p in made.parameters():
-                p.add_(torch.randn(p.shape, generator=generator(seed + 100)) * scale)
-        found.append(SpatialAr.exact(made.state()))
-    return found
-
-
-CASES = {
-    "one value": [(1, 1, 1)],
-    "many channels": [(19, 5, 4), (19, 10, 8)],
-    "narrow": [(9, 7, 1), (2, 1, 7)],
-    "nothing beside something": [(0, 4, 4), (3, 4, 4), (3, 0, 5)],
-    "more scales than the kernel takes": [(2, 3, 3)] * 5,
-}
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_planes_are_coded(case, kernels, monkeypatch):
-    monkeypatch.setattr("sw_codecs.context.plane_streams.SMALLEST_STREAM", 45)
-    shapes, models = CASES[case], spatial_models(3)
-    r = np.random.default_rng(0)
-    planes = [np.rint(r.laplace(0, 3, (3, *shape))).astype(np.int64) for shape in shapes]
-    for plane in planes:
-        plane.reshape(-1)[::40] += 70_000  # escapes
-    coded = both(kernels, lambda: SpatialAr.encode(planes, models))
-    assert coded[0] == coded[1]
-    for found in both(kernels, lambda: SpatialAr.decode(coded[0], shapes, models)):
-        assert all(np.array_equal(a, b) for a, b in zip(found, planes, strict=True))
-
-
-@pytest.mark.parametrize("compiled", [True, False])
-def test_damaged_planes_are_refused(compiled, kernels, assert_survives_damage, monkeypatch):
-    monkeypatch.setattr("sw_codecs.context.plane_streams.SMALLEST_STREAM", 12)
-    models = spatial_models(1)
-    plane = np.rint(np.random.default_rng(0).laplace(0, 40, (1, 3, 2, 3))).astype(np.int64)
-    kernels(compiled)
-    data = SpatialAr.encode([plane], models)
-    assert_survives_damage(data, lambda d: SpatialAr.decode(d, [(3, 2, 3)], models)[0], plane, masks=(0x81,))
-
-
-def test_streams_of_no_or_of_too_many_channels_are_refused():
-    models, plane = spatial_models(1), np.ones((1, 4, 3, 3), np.int64)
-    data = bytearray(SpatialAr.encode([plane], models))
-    place = len(exact_streams.prefix()) + 4
-    assert data[place] == 4
-    for channels in (0, 5):
-        data[place] = channels
-        with pytest.raises(BitstreamError):
-            SpatialAr.decode(bytes(data), [(4, 3, 3)], models)
-
-
-def test_threads_change_no_plane(kernels):
-    kernels(True)
-    models = spatial_models(3)
-    planes = [np.rint(np.random.default_rng(0).laplace(0, 3, (3, 12, 9, 9))).astype(np.int64)]
-    kept, found = torch.get_num_threads(), set()
-    try:
-        for threads in (1, 2, 5):
-            torch.set_num_threads(threads)
-            found.add(SpatialAr.encode(planes, models))
-    finally:
-        torch.set_num_threads(kept)
-    assert len(found) == 1

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from splatwizard_native import seeded
-from sw_codecs.context import hash_grid
-from sw_codecs.context.grid_lookup import fits_kernel
-from sw_codecs.context.hash_grid import HashGrid, MixedHashGrid
+from sw_codecs.context.fast import grid_lookup
+from sw_codecs.context.fast.grid_lookup import fits
+from sw_codecs.context.hash_grid import HashGrid
 from sw_codecs.native import CODECS
 
 needs_kernels = pytest.mark.skipif(CODECS.available() is not None, reason=str(CODECS.available()))
@@ -51,63 +51,13 @@ def test_values_and_gradients_are_those_of_torch(dimensions, features, device, m
     grid, x = real(dimensions, features).to(device), places(dimensions).to(device)
     assert 0 < sum(level.dense for level in grid.levels) < 5
     weights = torch.randn(len(x), grid.width, generator=generator(3)).to(device)
-    assert fits_kernel(grid, x, grid.table)
+    assert fits(grid, x, grid.table)
     found, gradient = both(grid, x, weights)
-    monkeypatch.setattr(hash_grid, "fits_kernel", lambda *_: False)
+    monkeypatch.setattr(grid_lookup, "fits", lambda *_: False)
     expected, wanted = both(grid, x, weights)
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)  # a sum of 8 products
     torch.testing.assert_close(gradient, wanted, rtol=1e-4, atol=1e-4)  # of some hundred on a coarse level
     assert gradient.any()
-
-
-@pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("features", [1, 2, 4])
-def test_signs_and_their_gradients_are_those_of_torch(features, device, monkeypatch):
-    grid = MixedHashGrid((6, 9, 34), (10, 66), features=features, log2_space=8, log2_planes=9, generator=generator())
-    with torch.no_grad():
-        for part in grid.grids:
-            part.table.copy_(torch.randn(part.table.shape, generator=generator(1)))
-    grid, x = grid.to(device), places(3).to(device)
-    weights = torch.randn(len(x), grid.width, generator=generator(3)).to(device)
-    assert grid.has_kernel(x)
-    found = []
-    for kernel in (True, False):
-        monkeypatch.setattr(hash_grid, "signs_fit_kernel", lambda *_, kernel=kernel: kernel)
-        features_of, bits = grid.with_bits(x)
-        total = (features_of * weights).sum() + 0.5 * bits
-        found.append((features_of.detach(), bits.detach(), *torch.autograd.grad(total, [p.table for p in grid.grids])))
-    for one, other in zip(*found, strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-4)
-        assert bool(one.any())
-    assert bool((found[0][0][2] == 0).all())  # outside the cube
-
-
-@needs_kernels
-def test_gradients_of_signs_are_the_same_bits_for_any_number_of_threads():
-    grid, runs, threads = MixedHashGrid((6, 9), (10, 34), log2_space=8, generator=generator()), [], []
-    for count in (1, 3):
-        threads.append(torch.get_num_threads())
-        torch.set_num_threads(count)
-        features, bits = grid.with_bits(places(3))
-        runs.append(torch.autograd.grad(features.square().sum() + bits, [part.table for part in grid.grids]))
-    torch.set_num_threads(threads[0])
-    assert all(torch.equal(a, b) for a, b in zip(*runs, strict=True))
-
-
-@needs_kernels
-def test_places_and_tables_of_signs_that_do_not_fit_are_refused():
-    CODECS.load()
-    levels = ([2.0], [3], [0], [1], 9)
-    look_up, x = torch.ops.sw_codecs.signs_lookup, torch.zeros(2, 3)
-    for axes, table, found, first, said in (
-        ([0, 3], (16, 2), (2, 2), 0, "no axis 3"),
-        ([0, 1], (15, 2), (2, 2), 0, "ends at entry 16 of 15"),
-        ([0, 1], (16, 2), (2, 3), 2, "features do not fit"),
-        ([0, 1], (16, 2), (1, 2), 0, "features must be contiguous"),
-        ([0, 1], (16, 9), (2, 9), 0, "1 to 8"),
-    ):
-        with pytest.raises(RuntimeError, match=said):
-            look_up(x, axes, torch.zeros(table), torch.zeros(found), first, *levels)
 
 
 @needs_kernels
@@ -139,12 +89,12 @@ def test_no_places_have_no_features_and_gradients_of_zero(device):
 @needs_kernels
 def test_what_has_no_kernel_goes_through_torch():
     grid, x = real(3, 2), places(3)[8:].requires_grad_(True)
-    assert not fits_kernel(grid, x, grid.table)
+    assert not fits(grid, x, grid.table)
     assert torch.autograd.grad(grid(x).square().sum(), x)[0].any()
-    assert not fits_kernel(grid.double(), x.detach().double(), grid.table)
-    assert not fits_kernel(real(3, 9), x.detach(), grid.table)
+    assert not fits(grid.double(), x.detach().double(), grid.table)
+    assert not fits(real(3, 9), x.detach(), grid.table)
     signs = HashGrid.binary_grid(3, (6, 9), features=2, log2_size=12, generator=generator())
-    assert not fits_kernel(signs, x.detach(), signs.table)
+    assert not fits(signs, x.detach(), signs.table)
 
 
 @needs_kernels
@@ -171,19 +121,13 @@ def test_levels_that_do_not_fit_the_table_are_refused(change, said):
 @pytest.mark.parametrize("slope", [1.0, 1e-12, 1e12])
 def test_where_it_is_asked_for_gradients_are_the_same_each_time_and_those_of_the_fast_sums(features, slope):
     """Thousands of places share the entries of a coarse level."""
-    grids = [
-        real(3, features).to("cuda"),
-        MixedHashGrid((6, 9, 34), (10, 66), features=features, log2_space=9, generator=generator()).to("cuda"),
-    ]
+    grid = real(3, features).to("cuda")
     x = places(3, 20_000).to("cuda")
 
     def gradients():
-        found = []
-        for grid in grids:
-            looked_up = grid(x)
-            slopes = torch.randn(looked_up.shape, generator=generator(3)).to("cuda") * slope
-            found += torch.autograd.grad((looked_up * slopes).sum(), list(grid.parameters()))
-        return found
+        looked_up = grid(x)
+        slopes = torch.randn(looked_up.shape, generator=generator(3)).to("cuda") * slope
+        return torch.autograd.grad((looked_up * slopes).sum(), list(grid.parameters()))
 
     fast = gradients()
     with seeded(0, deterministic=True):

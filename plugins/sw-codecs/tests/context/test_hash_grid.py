@@ -5,10 +5,7 @@ import itertools
 import pytest
 import torch
 
-from splatwizard_core.plugins import load_plugins
-from sw_codecs.context import hash_grid
-from sw_codecs.context.hash_grid import HashGrid, MixedHashGrid
-from sw_codecs.entropy.rates import mask_bits
+from sw_codecs.context.hash_grid import HashGrid
 
 
 def generator(seed=0):
@@ -141,64 +138,6 @@ def test_gradients_are_those_of_finite_differences(kind):
     assert torch.autograd.gradcheck(lambda x, values: grid(x, values), (x, values), eps=1e-7, atol=1e-5)
 
 
-def test_integers_agree_with_floats_at_the_lattice():
-    grid = MixedHashGrid((6, 9, 20), (10, 40), features=2, log2_space=9, log2_planes=10, generator=generator())
-    for each in grid.grids:
-        with torch.no_grad():
-            each.table.copy_(torch.randn(each.table.shape, generator=generator(7)))
-    codes = torch.randint(0, 65536, (400, 3), generator=generator(8))
-    codes[:3] = torch.tensor([[0, 0, 0], [65535, 65535, 65535], [0, 65535, 32768]])
-    found = grid.integer_features(codes)
-    assert found.dtype == torch.int64
-    assert found.shape == (400, 2 * (3 + 3 * 2)) == (400, grid.width)
-    floats = grid(codes.double().float() / 65535)
-    # Positions are cut to 1/4096 of a cell, results to 1/4096; near the border renormalising magnifies the first.
-    difference = (found / 4096 - floats.detach()).abs()
-    assert float(difference.quantile(0.99)) < 2e-3
-    assert float(difference.median()) < 5e-4
-
-
-def test_integers_do_not_depend_on_the_batch():
-    grid = MixedHashGrid((6, 20), (10,), features=2, log2_space=9, log2_planes=9, generator=generator())
-    codes = torch.randint(0, 65536, (97, 3), generator=generator(8))
-    whole = grid.integer_features(codes)
-    for size in (1, 7, 50):
-        assert torch.equal(torch.cat([grid.integer_features(part) for part in codes.split(size)]), whole)
-
-
-def test_the_published_grid_has_the_published_size():
-    grid = MixedHashGrid()
-    assert grid.width == 96
-    assert [g.table.shape[0] for g in grid.grids] == [95_944, 115_208, 115_208, 115_208]
-    assert grid.entries == 1_766_272
-
-
-def test_signs_survive_the_file():
-    grid = MixedHashGrid((6, 9), (10,), features=2, generator=generator(1))
-    other = MixedHashGrid((6, 9), (10,), features=2, generator=generator(2))
-    signs = grid.signs()
-    assert set(signs.tolist()) == {0, 1}
-    other.load_signs(signs.numpy())
-    x = torch.rand(20, 3, generator=generator(3))
-    assert torch.equal(other(x), grid(x))
-    with pytest.raises(ValueError, match="signs for"):
-        other.load_signs(signs[:-1])
-
-
-def test_the_rate_of_the_signs_is_that_of_their_share_of_ones():
-    grid = MixedHashGrid((6,), (10,), features=2, generator=generator(1))
-    with torch.no_grad():
-        for each in grid.grids:
-            each.table.copy_(torch.rand(each.table.shape, generator=generator(4)) - 0.2)
-    _, bits = grid.with_bits(torch.rand(3, 3))
-    p = float(grid.signs().double().mean())
-    n = grid.entries
-    entropy = -n * (p * torch.log2(torch.tensor(p)) + (1 - p) * torch.log2(torch.tensor(1 - p)))
-    assert float(bits.detach()) == pytest.approx(float(entropy) + 32, rel=1e-4)
-    bits.backward()
-    assert all(float(each.table.grad.max()) < 0 for each in grid.grids)  # more ones, fewer bits
-
-
 def test_grids_that_make_no_sense_are_refused():
     with pytest.raises(ValueError, match="3 or more"):
         HashGrid.binary_grid(3, (2,), features=1, log2_size=4, generator=generator())
@@ -208,51 +147,3 @@ def test_grids_that_make_no_sense_are_refused():
         HashGrid.binary_grid(3, (1 << 17,), features=1, log2_size=4, generator=generator())
     with pytest.raises(ValueError, match="binary"):
         HashGrid.real_grid(levels=1, generator=generator()).integer_features(torch.zeros(1, 3, dtype=torch.int64))
-
-
-def test_it_is_found_by_name():
-    assert load_plugins().context_models.load("hash-grid") is MixedHashGrid
-
-
-@pytest.mark.cuda
-def test_cuda_equals_cpu():
-    grid = MixedHashGrid((18, 24), (34,), generator=generator(1))
-    codes = torch.randint(0, 65536, (500, 3), generator=generator(2))
-    features, integers = grid(codes / 65535), grid.integer_features(codes)
-    there = grid.cuda()
-    torch.testing.assert_close(there(codes.cuda() / 65535).cpu(), features, atol=1e-5, rtol=1e-5)
-    assert torch.equal(there.integer_features(codes.cuda()).cpu(), integers)
-
-
-def test_all_grids_in_one_lookup_equal_them_one_by_one(monkeypatch):
-    grid = MixedHashGrid([6, 9, 20], [9, 40], features=3, log2_space=7, log2_planes=6, generator=generator())
-    with torch.no_grad():
-        for each in grid.grids:
-            each.table.copy_(torch.randn(each.table.shape, generator=generator(1)))
-    x = torch.cat([torch.rand(50, 3, generator=generator(2)), torch.tensor([[0.0, 1.0, 1.2]])])
-    weights = torch.randn(51, grid.width, generator=generator(3))
-
-    def one_by_one():
-        values = [each.values() for each in grid.grids]
-        found = [each(x[:, list(axes)], v) for each, axes, v in zip(grid.grids, grid.AXES, values, strict=True)]
-        ones = torch.cat([(v.reshape(-1) + 1) / 2 for v in values])
-        return torch.cat(found, dim=1), mask_bits(ones)
-
-    places = grid.places(x)
-    halves = grid.places(x[:20]), grid.places(x[20:])
-    assert all(torch.equal(a, torch.cat(b)) for a, b in zip(places, zip(*halves, strict=True), strict=True))
-    assert all(torch.equal(a[5:7], b) for a, b in zip(places, places.rows(torch.tensor([5, 6])), strict=True))
-    with monkeypatch.context() as patch:
-        patch.setattr(hash_grid, "PLACE_ROWS", 16)
-        assert all(torch.equal(a, b) for a, b in zip(places, grid.places(x), strict=True))
-    assert grid.place_bytes == sum(each[0].numel() * each.element_size() for each in places)
-    tables = [each.table for each in grid.grids]
-    results, gradients = [], []
-    for found in (grid.at_places(places), one_by_one()):
-        results.append(found)
-        gradients.append(torch.autograd.grad((found[0] * weights).sum() + 0.3 * found[1], tables))
-    for a, b in zip(results[0], results[1], strict=True):
-        torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-5)
-    for a, b in zip(*gradients, strict=True):
-        torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-5)
-    assert grid.at_places(grid.places(torch.zeros(0, 3)))[0].shape == (0, grid.width)

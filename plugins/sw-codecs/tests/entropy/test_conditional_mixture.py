@@ -104,7 +104,7 @@ def test_the_probabilities_are_the_weighted_sum_of_both_tables():
     assert weight == pytest.approx(256 * 0.731, abs=8)
     context = C.Context(*(np.array([[each]]) for each in (0, 4096, 3 * 4096, 2 * 4096, 4096, 4096)))
     levels = [int(np.searchsorted(tables.thresholds, each << 12 >> 12)) for each in (4096, 2 * 4096)]
-    counts = [np.asarray(tables.gaussian.tables[8 * level + 4].counts) for level in levels]
+    counts = [tables.gaussian.counts[8 * level + 4] for level in levels]
     radius = [int(tables.gaussian.radius[level]) for level in levels]
     width = int(WIDTHS[np.searchsorted(WIDTHS, max(radius[0], radius[1] + 3))])
     expected = np.ones(2 * width + 2)

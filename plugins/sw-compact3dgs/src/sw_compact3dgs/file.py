@@ -95,7 +95,7 @@ def _for_file(model: CompactGaussians) -> CompactGaussians:
     bad = model.check_finite()
     if bad:
         raise SplatwizardError(f"{bad:,} Gaussians hold values that are not finite: they cannot be encoded")
-    kept = torch.nonzero(model.mask_on()).squeeze(1)
+    kept = torch.nonzero(model.rate.exact(model.mask_logits)).squeeze(1)
     if not len(kept):
         raise SplatwizardError("the mask turned all Gaussians off: lower mask.weight or mask.factor")
     halves = model.means[kept].clamp(-HALF_MAX, HALF_MAX).half().float()

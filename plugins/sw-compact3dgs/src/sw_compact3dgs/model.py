@@ -13,6 +13,7 @@ from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 from splatwizard_core.api import SH, GaussianInputs, stream
 from sw_codecs.quantizers.residual_quantizer import ResidualVectorQuantizer
 from sw_codecs.quantizers.straight_through import straight_through
+from sw_compact3dgs.mask_rate import MaskRate
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Camera, Rasterizer
@@ -45,6 +46,7 @@ class CompactGaussians(VolumeMaskedGaussians):
     color       the colour field; SH coefficients of the base class are not used
     scale_vq    codebooks of the scales, [3] world units, before the mask
     quat_vq     codebooks of the quaternions, normalised
+    rate        what masks cost: the loss and the file hold the same
     phase       "plain", or "quantized": what is drawn has the shapes that the codebooks give
     """
 
@@ -53,6 +55,7 @@ class CompactGaussians(VolumeMaskedGaussians):
     ) -> None:
         super().__init__(*tensors, quantizer=quantizer, init=init)
         self.color = color
+        self.rate = MaskRate(quantizer, size, stages)
         self.scale_vq = ResidualVectorQuantizer(size, stages, dim=3)
         self.quat_vq = ResidualVectorQuantizer(size, stages, dim=4)
         self.phase = PLAIN
@@ -60,9 +63,9 @@ class CompactGaussians(VolumeMaskedGaussians):
     def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
         """All Gaussians with the colours of this camera, those that it does not see in grey.
 
-        extras: "mask", the sigmoid of the logits [N]; "codebooks", the loss of the codebooks once they are there.
+        extras: "mask", the forecast of `rate` [N]; "codebooks", the loss of the codebooks once they are there.
         """
-        mask, extras = self.mask(), {"mask": torch.sigmoid(self.mask_logits)}
+        mask, extras = self.mask(), {"mask": self.rate.forecast(self.mask_logits)}
         scales, quats = self.scales, self.unit_quats()
         if self.phase == QUANTIZED:
             sums, scale_loss = self.scale_vq.forward_with_loss(scales)

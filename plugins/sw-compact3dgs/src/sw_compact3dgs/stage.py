@@ -91,8 +91,9 @@ class Compact3DGSStage(ThreeDGSStage):
 
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
         """The photometric loss, the mean mask, and once there are codebooks their own loss, which moves them alone."""
+        assert isinstance(model, CompactGaussians)
         pack, mask = super().loss(model, view, result, background, step), self.own.mask
-        parts = {"mask": result.extras["mask"].mean()}
+        parts = {"mask": model.rate.share(result.extras["mask"])}
         total = pack.total + mask.weight * mask.factor * parts["mask"]
         if "codebooks" in result.extras:
             parts["codebooks"] = result.extras["codebooks"]

@@ -1,6 +1,6 @@
 """The file of HAC++. What the decoder needs to predict every distribution stands before what is coded with it.
 
-Sections: `anchors` (sw_anchors.voxel_lattice), `masks`, `networks` (sw_anchors.sections), `grids` (a bit for every
+Sections: `anchors` (sw_hac_plus.voxel_lattice), `masks`, `networks` (sw_anchors.sections), `grids` (a bit for every
 sign), the integers of `features.1`, ... (a section a slice, `conditional-mixture`), `scalings` and `offsets`
 (`conditional-gaussian`), block by block of anchors. Without a channel context the features are one section, as in HAC.
 """
@@ -10,26 +10,25 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import torch
-from sw_anchors import grid_predictors, grid_sections
-from sw_anchors.attribute_sections import AttributeCoder, AttributeDecoder, AttributeEncoder, Block
+from sw_anchors.attribute_sections import AttributeCoder, AttributeDecoder, AttributeEncoder, Block, Coders
 from sw_anchors.decoded_anchors import DecodedAnchors
+from sw_anchors.float_mode import Mode
 from sw_anchors.header import read_integers
 from sw_anchors.sections import add_networks, read_networks
-from sw_anchors.voxel_lattice import VoxelGeometry, add_voxels, kept_voxels, read_voxels
 
 from splatwizard_core.api import BitstreamError
-from sw_codecs.context.channel_mixture import PARTS, ChannelMixture
 from sw_codecs.context.two_layers import two_layers
-from sw_hac_plus.predictors import PREDICTORS, Predictor
+from sw_codecs.entropy.rows import RowMixture
+from sw_hac import codec as hac_codec
+from sw_hac_plus.channel_mixture import PARTS, ChannelMixture
+from sw_hac_plus.rate_model import ExactMixtures, FloatMixtures, HACPlusRateModel, Predictor
+from sw_hac_plus.voxel_lattice import VoxelGeometry, add_voxels, kept_voxels, read_voxels
 
 if TYPE_CHECKING:
-    from sw_anchors.float_mode import Mode
-    from sw_anchors.grid_params import GridFileSettings
-    from sw_anchors.shape import AnchorShape
     from torch import nn
 
-    from splatwizard_core.api import ContainerReader, ContainerWriter
-    from sw_codecs.context.hash_grid import MixedHashGrid
+    from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager
+    from sw_hac.config import FileSettings
     from sw_hac_plus.model import HACPlusAnchors
 
 KINDS = ("full", "tiny", "none")
@@ -37,82 +36,55 @@ AFTER_FEATURES = {"scales": "scalings", "offsets": "offsets"}
 """Group -> section, of what one Gaussian predicts."""
 
 
-def encode(model: HACPlusAnchors, writer: ContainerWriter, settings: GridFileSettings) -> None:
+def encode(model: HACPlusAnchors, writer: ContainerWriter, settings: FileSettings, plugins: PluginManager) -> None:
     """Write all sections; the model stays as it is."""
-    model = grid_sections.settled_copy(model, settings.weights)
+    model = hac_codec.settled_copy(model, settings.weights)
     geometry, rows = kept_voxels(model)
-    grid_sections.add_header(model, writer, settings.mode)
+    hac_codec.add_header(model, writer, settings.mode)
     _add_channel(writer, model.channel)
-    add_voxels(writer, geometry)
-    grid_sections.add_grid(writer, model.grid)
+    add_voxels(writer, geometry, plugins)
+    hac_codec.add_grid(writer, model.grid, plugins)
     add_networks(writer, model.networks(), settings.weights)
 
     writer.require("context model", "integer-mlp")
-    attributes = AttributeEncoder(model, rows, sections(model.channel), settings.mode)
-    walk = Walk(settings.mode, model.grid, model.mlp_grid, model.channel, model.shape, model.base_steps)
-    walk(attributes, geometry)
+    further = mixtures(model.channel, settings.mode, plugins)
+    attributes = AttributeEncoder(model, rows, sections(model.channel), settings.mode, plugins, further)
+    walk(attributes, model.rate_model.predictor(settings.mode), model.channel, geometry)
     attributes.write(writer)
     writer.allow(len(rows) * model.shape.decoded_bytes, f"a model of {len(rows):,} anchors")
 
 
-def decode(reader: ContainerReader) -> DecodedAnchors:
+def decode(reader: ContainerReader, plugins: PluginManager) -> DecodedAnchors:
     """Raises BitstreamError for damage, and for a file of mode `float` that another machine wrote."""
-    header = grid_sections.read_header(reader)
+    header = hac_codec.read_header(reader)
     shape = header.shape
     channel = _read_channel(reader, shape.features)
-    geometry = read_voxels(reader, bytes_per_anchor=shape.decoded_bytes)
-    grid = grid_sections.read_grid(reader, header.grid_features)
+    geometry = read_voxels(reader, plugins, bytes_per_anchor=shape.decoded_bytes)
+    grid = hac_codec.read_grid(reader, header.grid_features, plugins)
     model = DecodedAnchors.zeros(geometry, shape, hidden=header.hidden)
     outputs = sum(shape.outputs) + (0 if channel is None else shape.features)
     mlp_grid = two_layers(grid.width, header.grid_hidden, outputs, torch.Generator())
     networks: dict[str, nn.Module] = {name: getattr(model, name) for name in model.NETWORKS}
     read_networks(reader, networks | {"mlp_grid": mlp_grid} | ({} if channel is None else {"channel": channel}))
+    base = torch.tensor(header.base_steps)
+    rate_model = HACPlusRateModel(grid, mlp_grid, shape, header.base_steps, base, channel=channel)
     with reader.decoding("networks"):
-        walk = Walk(header.mode, grid, mlp_grid, channel, shape, header.base_steps)
-    attributes = AttributeDecoder(reader, model, sections(channel), header.mode)
-    walk(attributes, geometry)
+        predictor = rate_model.predictor(header.mode)
+    further = mixtures(channel, header.mode, plugins)
+    attributes = AttributeDecoder(reader, model, sections(channel), header.mode, plugins, further)
+    walk(attributes, predictor, channel, geometry)
     attributes.finish()
     return model
 
 
-class Walk:
-    """The way over all blocks of anchors, on which each distribution is predicted from what is known by then."""
-
-    def __init__(
-        self,
-        mode: Mode,
-        grid: MixedHashGrid,
-        network: nn.Sequential,
-        channel: ChannelMixture | None,
-        shape: AnchorShape,
-        base_steps: tuple[float, float, float],
-    ) -> None:
-        """Raises ValueError if a network cannot be evaluated exactly."""
-        self._channel = channel
-        self._alone = self._predictor = None
-        if channel is None:
-            self._alone = grid_predictors.PREDICTORS[mode](grid, network, shape, base_steps)
-        else:
-            self._predictor = PREDICTORS[mode](grid, network, channel, shape, base_steps)
-
-    def __call__(self, attributes: AttributeCoder, geometry: VoxelGeometry) -> None:
-        """Code all groups of each block: features slice by slice, then scales, then the offsets that masks keep."""
-        if self._alone is not None:
-            grid_sections.walk(attributes, self._alone, geometry)
-            return
-        assert self._predictor is not None
-        assert self._channel is not None
-        for rows in attributes.rows:
-            self._block(attributes, geometry, rows, self._predictor, self._channel)
-
-    @staticmethod
-    def _block(
-        attributes: AttributeCoder,
-        geometry: VoxelGeometry,
-        rows: slice,
-        predictor: Predictor,
-        channel: ChannelMixture,
-    ) -> None:
+def walk(
+    attributes: AttributeCoder, predictor: Predictor, channel: ChannelMixture | None, geometry: VoxelGeometry
+) -> None:
+    """Code all groups of each block: features slice by slice, then scales, then the offsets that masks keep."""
+    if channel is None or not isinstance(predictor, (ExactMixtures, FloatMixtures)):
+        hac_codec.walk(attributes, predictor, geometry)
+        return
+    for rows in attributes.rows:
         first = predictor.first(geometry.codes[rows])
         _, steps = first.groups["features"]
         known = first.context.new_empty(len(first.context), sum(channel.slices))
@@ -121,13 +93,18 @@ class Walk:
             mixture = predictor.mixture(i, columns, first, known[:, : columns.start])
             symbols = attributes.code(Block(f"features.{i + 1}", "features", rows, columns), mixture, steps)
             known[:, columns] = predictor.known(symbols, first)
-        grid_sections.code_groups(attributes, first.groups, geometry.masks[rows], rows, AFTER_FEATURES)
+        hac_codec.code_groups(attributes, first.groups, geometry.masks[rows], rows, AFTER_FEATURES)
+
+
+def mixtures(channel: ChannelMixture | None, mode: Mode, plugins: PluginManager) -> Coders:
+    """Return the entropy model of what two Gaussians predict, if anything is."""
+    return {} if channel is None else {RowMixture: plugins.entropy_models.load("conditional-mixture")(mode)}
 
 
 def sections(channel: ChannelMixture | None) -> list[str]:
     """Names of the sections of attributes, in file order."""
     if channel is None:
-        return list(grid_sections.SECTIONS.values())
+        return list(hac_codec.SECTIONS.values())
     return [*(f"features.{i + 1}" for i in range(len(channel.slices))), *AFTER_FEATURES.values()]
 
 

@@ -4,10 +4,10 @@ from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
-from sw_anchors.grid_params import GridAnchorParams, GridFileSettings, GridLearningRates, Phases, RateTerm
 from sw_gaussians.choices import Choosing, OwnCodec
 
 from splatwizard_core.api import Params
+from sw_hac.config import FileSettings, HACLearningRates, HACParams, Phases, RateTerm
 
 
 class Channels(Params):
@@ -27,7 +27,7 @@ class Channels(Params):
     )
 
 
-class HACPlusLearningRates(GridLearningRates):
+class HACPlusLearningRates(HACLearningRates):
     """Adam step sizes; from `init` to `final` exponentially over `max_steps`."""
 
     masks_final: float | None = Field(  # type: ignore[assignment]
@@ -62,10 +62,10 @@ class Codec(OwnCodec):
     """The file of HAC++, which no other codec can write."""
 
     name: Literal["hac-plus"] = Field("hac-plus", description="the file of HAC++")
-    settings: GridFileSettings = Field(GridFileSettings(), description="settings of the file")
+    settings: FileSettings = Field(FileSettings(), description="settings of the file")
 
 
-class HACPlusConfig(Choosing, GridAnchorParams):
+class HACPlusConfig(Choosing, HACParams):
     """Everything that can be set for HAC++."""
 
     ABSENT: ClassVar[Mapping[str, Any]] = {}

@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from sw_anchors.voxel_lattice import check_reach
-
 from splatwizard_core.api import ConfigError, Method, SceneError
-from sw_codecs.context.channel_mixture import PARTS, ChannelMixture
 from sw_hac_plus import codec
+from sw_hac_plus.channel_mixture import PARTS, ChannelMixture
 from sw_hac_plus.config import HACPlusConfig
 from sw_hac_plus.model import HACPlusAnchors
 from sw_hac_plus.presets import BY_DATASET, PRESETS, RATES
 from sw_hac_plus.stage import HACPlusStage
+from sw_hac_plus.voxel_lattice import check_reach
 
 if TYPE_CHECKING:
     import torch
@@ -73,8 +72,8 @@ class HACPlus(Method):
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         if not isinstance(model, HACPlusAnchors):
             raise TypeError(f"hac-plus encodes its own anchors, not a {type(model).__name__}")
-        codec.encode(model, writer, self.config.codec.settings)
+        codec.encode(model, writer, self.config.codec.settings, self.plugins)
 
     def decode(self, reader: ContainerReader) -> SplatModel:
         self.check_version(reader)
-        return codec.decode(reader)
+        return codec.decode(reader, self.plugins)

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
-from sw_anchors.dataset_values import BY_DATASET as HAC_VALUES
-from sw_anchors.grid_quick import QUICK
+from sw_hac.presets import BY_DATASET as HAC_VALUES
+from sw_hac.presets import QUICK
 
 _OWN: Mapping[str, Mapping[str, Any]] = {
     "tandt": {"lr.masks_by_rate": 0.1},

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sw_anchors.grid_stage import GridStage
-
+from sw_hac.stage import HACStage
 from sw_hac_plus.config import HACPlusConfig
 
 if TYPE_CHECKING:
@@ -19,7 +18,7 @@ SMALLEST_RATE = 1e-7
 """Final rate of the masks where lambda is 0."""
 
 
-class HACPlusStage(GridStage):
+class HACPlusStage(HACStage):
     """One stage of 30,000 steps."""
 
     name = "hac-plus"

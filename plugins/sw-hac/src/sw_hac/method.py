@@ -5,25 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from sw_anchors.dataset_values import BY_DATASET
-from sw_anchors.grid_anchors import GridAnchors
-from sw_anchors.grid_stage import GridStage
-
 from splatwizard_core.api import Method
 from sw_hac import codec
 from sw_hac.config import HACConfig
-from sw_hac.presets import PRESETS, RATES
+from sw_hac.model import HACAnchors
+from sw_hac.presets import BY_DATASET, PRESETS, RATES
+from sw_hac.stage import HACStage
 
 if TYPE_CHECKING:
     import torch
 
     from splatwizard_core.api import ContainerReader, ContainerWriter, Scene, SplatModel, Stage
-
-
-class HACStage(GridStage):
-    """One stage of 30,000 steps."""
-
-    name = "hac"
 
 
 class HAC(Method):
@@ -42,16 +34,16 @@ class HAC(Method):
 
     def create_model(self, scene: Scene, generator: torch.Generator) -> SplatModel:
         """Put an anchor into every voxel with a start point of the scene."""
-        return GridAnchors.of_scene(scene, self.config, generator)
+        return HACAnchors.of_scene(scene, self.config, generator)
 
     def stages(self) -> Sequence[Stage]:
         return [HACStage(self.config)]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
-        if not isinstance(model, GridAnchors):
+        if not isinstance(model, HACAnchors):
             raise TypeError(f"hac encodes its own anchors, not a {type(model).__name__}")
-        codec.encode(model, writer, self.config.codec.settings)
+        codec.encode(model, writer, self.config.codec.settings, self.plugins)
 
     def decode(self, reader: ContainerReader) -> SplatModel:
         self.check_version(reader)
-        return codec.decode(reader)
+        return codec.decode(reader, self.plugins)

@@ -1,9 +1,9 @@
-"""Context model `hash-grid`: multi-resolution grids of learned features, looked up by position.
+"""Multi-resolution grids of learned features, looked up by position.
 
 Two kinds. `HashGrid.binary`: signs of learned numbers, as in HAC (arXiv 2403.14530): vertices on the border do not
 take part, the other weights are brought to sum 1, and outside [0,1] all features are 0. `HashGrid.real`: the learned
 numbers themselves, as in instant-ngp (arXiv 2201.05989). A level whose vertices all fit its table is dense, any other
-is hashed. `MixedHashGrid` puts a binary grid over space and three over its planes side by side.
+is hashed.
 
 For files the lookup of 16-bit position codes is done in integers alone (`integer_features`), so that every machine
 has the same features. Source: specification of the codec library, context models, and exact mode, rule 2.
@@ -11,18 +11,16 @@ has the same features. Source: specification of the codec library, context model
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
-from sw_codecs.context.grid_lookup import fits_kernel, levels_of, lookup, signs_fit_kernel
-from sw_codecs.context.grid_nodes import BinaryLookup, SignLookup, WeightedRows
+from splatwizard_native import fast_enabled
+from sw_codecs.context.fast import grid_lookup
 from sw_codecs.exact_native import EXACT
 from sw_codecs.quantizers.binary import SteBinary
 
@@ -32,8 +30,6 @@ FRACTION = 12
 POSITION_TOP = 65535
 INTEGER_ROWS = 1 << 14
 """Rows of `integer_features` that are looked up together."""
-PLACE_ROWS = 1 << 16
-"""Rows of `places` that are worked out together."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +47,20 @@ class Level:
     size: int
     start: int
     dense: bool
+
+
+def corner_lookup(grid: HashGrid, x: Tensor, values: Tensor) -> Tensor:
+    """Features [n, width] of places [n,d], from the corners of their cells; differentiable for values and x."""
+    n, levels = len(x), len(grid.levels)
+    index, weights = grid.corners_of(x)
+    add_up = grid_lookup.weighted_rows if fast_enabled() else weighted_rows
+    found = add_up(values, index.view(n * levels, -1), weights.to(values.dtype).view(n * levels, -1), levels)
+    return grid.in_order(found.view(n, levels, grid.features))
+
+
+def weighted_rows(values: Tensor, index: Tensor, weights: Tensor, levels: int) -> Tensor:
+    """sum_c weights[b,c] values[index[b,c]]: [B,F] from values [E,F]; bag b belongs to level b % levels."""
+    return F.embedding_bag(index, values, per_sample_weights=weights, mode="sum")
 
 
 class HashGrid(nn.Module):
@@ -158,24 +168,16 @@ class HashGrid(nn.Module):
         values  `self.values()`, if the caller has them already
         """
         values = self.values() if values is None else values
-        n, levels = len(x), len(self.levels)
-        if n == 0:
+        if len(x) == 0:
             return values.new_zeros(0, self.width)
-        if fits_kernel(self, x, values):
-            return lookup(self, x, values)
-        index, weights = self._corners_of(x)
-        index, weights = index.view(n * levels, -1), weights.to(values.dtype).view(n * levels, -1)
-        found = WeightedRows.apply(values, index, weights, levels)
-        return self._sorted(found.view(n, levels, self.features))
+        look_up = grid_lookup.lookup if grid_lookup.fits(self, x, values) else corner_lookup
+        return look_up(self, x, values)
 
-    @torch.no_grad()
-    def places(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Entries of the table (int32) and their weights (dtype of x), both [n, levels, 2^d], levels in their order."""
-        index, weights = self._corners_of(x)
-        return (index, weights) if self._in_order else (index[:, self._order], weights[:, self._order])
+    def corners_of(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Entries of the table (int32) and their weights (dtype of x), both [n, levels, 2^d], the order of the buffers.
 
-    def _corners_of(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """The same in the order of the buffers; weights are differentiable for x."""
+        Weights are differentiable for x.
+        """
         inside = ((x >= 0) & (x <= 1)).all(dim=1, keepdim=True)
         lower, ends = [], []
         for coordinate in x.clamp(0, 1).unbind(1):
@@ -205,13 +207,13 @@ class HashGrid(nn.Module):
             raise ValueError(f"position codes must be integers [n, {self.dimensions}], not {list(codes.shape)}")
         if codes.device.type == "cpu" and self.dimensions == 3 and self.features <= 16 and EXACT.try_load():
             found = codes.new_empty(len(codes), self.width, dtype=torch.int64)
-            self._kernel_features(codes.to(torch.int64).contiguous(), (0, 1, 2), found, 0)
+            self.kernel_features(codes.to(torch.int64).contiguous(), (0, 1, 2), found, 0)
             return found
         signs = torch.where(self.table.detach() >= 0, 1.0, -1.0).to(torch.float64)
         blocks = [self._integer_block(block, signs) for block in codes.to(torch.int64).split(INTEGER_ROWS)]
         return torch.cat(blocks) if blocks else codes.new_zeros(0, self.width, dtype=torch.int64)
 
-    def _kernel_features(self, codes: Tensor, axes: Sequence[int], into: Tensor, column: int) -> None:
+    def kernel_features(self, codes: Tensor, axes: Sequence[int], into: Tensor, column: int) -> None:
         """Write `integer_features` for some axes of codes int64 [n,3] into columns of `into` from `column` on."""
         order = torch.argsort(self._order)  # buffers hold dense levels first
         levels = torch.stack([self._last, self._start.to(torch.int64), column + order * self.features])
@@ -246,7 +248,7 @@ class HashGrid(nn.Module):
         sums = F.embedding_bag(index, signs, per_sample_weights=weights.flatten(0, 1).to(torch.float64), mode="sum")
         found = sums.to(torch.int64).view(*total.shape, self.features)
         found = torch.div(found << FRACTION, total.clamp(min=1)[..., None], rounding_mode="floor")
-        return self._sorted(found * inside[:, None, None])
+        return self.in_order(found * inside[:, None, None])
 
     def _off_border(self, near: Tensor, far: Tensor, lower: Tensor) -> tuple[Tensor, Tensor]:
         """Weights [n,L] of the two ends of an axis, 0 where the end is a border vertex."""
@@ -269,7 +271,7 @@ class HashGrid(nn.Module):
             found.append(_corners(hashed, torch.bitwise_xor))
         return torch.cat(found, dim=1).add_(self._start[:, None])
 
-    def _sorted(self, found: Tensor) -> Tensor:
+    def in_order(self, found: Tensor) -> Tensor:
         """[n, width] from [n,L,F] in the order of the buffers."""
         if not self._in_order:
             found = found[:, self._order]
@@ -278,166 +280,6 @@ class HashGrid(nn.Module):
     def extra_repr(self) -> str:
         kind = "binary" if self.binary else "real"
         return f"{kind}, {self.dimensions} axes, resolutions {[level.resolution for level in self.levels]}"
-
-
-class GridPlaces(NamedTuple):
-    """Of n points in a MixedHashGrid: entries (int32, of all its tables in a row) and weights of the corners.
-
-    space, space_weights        [n, levels over space, 8]
-    planes, planes_weights      [n, levels over the three planes, 4]
-    """
-
-    space: Tensor
-    space_weights: Tensor
-    planes: Tensor
-    planes_weights: Tensor
-
-    def rows(self, rows: Tensor) -> GridPlaces:
-        """Those of some of the points."""
-        return GridPlaces(*(each.index_select(0, rows) for each in self))
-
-
-class MixedHashGrid(nn.Module):
-    """Binary grids over (x,y,z), (x,y), (x,z) and (y,z), outputs in this order: the context of HAC.
-
-    space, planes   resolutions of the levels over space, and over each plane
-    features        numbers an entry has
-    log2_space, log2_planes     logarithms of the largest table of a level
-    """
-
-    AXES = ((0, 1, 2), (0, 1), (0, 2), (1, 2))
-    Grid = HashGrid
-
-    def __init__(
-        self,
-        space: Sequence[int] = (18, 24, 33, 44, 59, 80, 108, 148, 201, 275, 376, 514),
-        planes: Sequence[int] = (130, 258, 514, 1026),
-        *,
-        features: int = 4,
-        log2_space: int = 13,
-        log2_planes: int = 15,
-        generator: torch.Generator | None = None,
-    ) -> None:
-        super().__init__()
-        self.grids = nn.ModuleList(
-            HashGrid.binary_grid(
-                len(axes),
-                space if len(axes) == 3 else planes,
-                features=features,
-                log2_size=log2_space if len(axes) == 3 else log2_planes,
-                generator=generator,
-            )
-            for axes in self.AXES
-        )
-
-    @staticmethod
-    def count(space: Sequence[int], planes: Sequence[int], *, features: int, log2_space: int, log2_planes: int) -> int:
-        """`entries` of such a grid, before anything is allocated."""
-        sizes = [table_size(r, 3, log2_space) for r in space] + 3 * [table_size(r, 2, log2_planes) for r in planes]
-        return features * sum(sizes)
-
-    @property
-    def width(self) -> int:
-        """Number of outputs."""
-        return sum(grid.width for grid in self._all())
-
-    @property
-    def entries(self) -> int:
-        """Number of signs."""
-        return sum(grid.table.numel() for grid in self._all())
-
-    def forward(self, x: Tensor) -> Tensor:
-        """[n,3] in [0,1] -> [n, width]."""
-        return self.with_bits(x)[0]
-
-    def with_bits(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """The features, and the bits of all signs under their own share of ones (+ 32), a differentiable scalar.
-
-        Not differentiable for x.
-        """
-        if not self.has_kernel(x):
-            return self.at_places(self.places(x))
-        grids = [(axes, levels_of(grid)) for axes, grid in zip(self.AXES, self._all(), strict=True)]
-        tables = [grid.table for grid in self._all()]
-        features, bits = SignLookup.apply(x.detach().contiguous(), grids, *tables)
-        return features, bits
-
-    def has_kernel(self, x: Tensor) -> bool:
-        """Whether `with_bits` of places like `x` works out their corners by a kernel: then nobody need keep them."""
-        return signs_fit_kernel(self._all(), x)
-
-    @property
-    def corners(self) -> int:
-        """Corners of all cells around a place."""
-        return sum(len(grid.levels) << grid.dimensions for grid in self._all())
-
-    @property
-    def place_bytes(self) -> int:
-        """Of `places`, a row."""
-        return 8 * self.corners
-
-    @torch.no_grad()
-    def places(self, x: Tensor) -> GridPlaces:
-        """Entries and weights of places [n,3] in [0,1], which training does not change."""
-        blocks = map(self._places, x.split(PLACE_ROWS))
-        first = next(blocks)
-        if len(first.space) == len(x):
-            return first
-        # Written in place: joined afterwards, all of it would be there twice.
-        found, start = GridPlaces(*(each.new_empty(len(x), *each.shape[1:]) for each in first)), 0
-        for block in itertools.chain([first], blocks):
-            for whole, part in zip(found, block, strict=True):
-                whole[start : start + len(part)] = part
-            start += len(part)
-        return found
-
-    def _places(self, x: Tensor) -> GridPlaces:
-        start, found = 0, []
-        for grid, axes in zip(self._all(), self.AXES, strict=True):
-            index, weights = grid.places(x[:, list(axes)])
-            found.append((index + start, weights))
-            start += len(grid.table)
-        planes = [torch.cat([each[i] for each in found[1:]], dim=1) for i in (0, 1)]
-        return GridPlaces(*found[0], *planes)
-
-    def at_places(self, places: GridPlaces) -> tuple[Tensor, Tensor]:
-        """`with_bits` of what `places` was made from."""
-        features, bits = BinaryLookup.apply(*places, *(grid.table for grid in self._all()))
-        return features, bits
-
-    def integer_features(self, codes: Tensor, dtype: torch.dtype = torch.int64) -> Tensor:
-        """[n,3] 16-bit codes -> [n, width] with 12 fractional bits, at most 1 in magnitude: int64, or int16."""
-        first = self._all()[0]
-        if codes.device.type == "cpu" and first.features <= 16 and EXACT.try_load():
-            codes, column = codes.to(torch.int64).contiguous(), 0
-            found = codes.new_empty(len(codes), self.width, dtype=dtype)
-            for grid, axes in zip(self._all(), self.AXES, strict=True):
-                grid._kernel_features(codes, axes, found, column)
-                column += grid.width
-            return found
-        return torch.cat(
-            [grid.integer_features(codes[:, list(axes)]) for grid, axes in zip(self._all(), self.AXES, strict=True)],
-            dim=1,
-        ).to(dtype)
-
-    def signs(self) -> Tensor:
-        """[entries] int64 of 0 and 1, grid by grid, level by level, entry by entry: what the file holds."""
-        return torch.cat([(grid.table.detach() >= 0).reshape(-1) for grid in self._all()]).to(torch.int64)
-
-    @torch.no_grad()
-    def load_signs(self, signs: Any) -> None:
-        """Inverse of `signs`. Raises ValueError for another number of them."""
-        values = torch.as_tensor(signs).reshape(-1)
-        if len(values) != self.entries:
-            raise ValueError(f"{len(values):,} signs for {self.entries:,} entries")
-        start = 0
-        for grid in self._all():
-            part = values[start : start + grid.table.numel()]
-            grid.table.copy_(part.view_as(grid.table).to(grid.table) * 2 - 1)
-            start += grid.table.numel()
-
-    def _all(self) -> list[HashGrid]:
-        return [grid for grid in self.grids if isinstance(grid, HashGrid)]
 
 
 def real_levels(levels: int, coarsest: float, finest: float) -> list[tuple[float, int]]:

@@ -9,7 +9,6 @@ same floats again: for comparison with published sizes. Source: specification of
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,27 +20,14 @@ from sw_codecs.bits.packing import ByteReader, write_varint
 from sw_codecs.coders.arithmetic import RangeCoder
 from sw_codecs.coders.model_spec import K_LIMIT, Gaussian
 from sw_codecs.entropy.gaussian_exact import GaussianExact
-from sw_codecs.entropy.lattice import RowLattice, lattice
+from sw_codecs.entropy.lattice import lattice
 from sw_codecs.entropy.rates import gaussian_bits
+from sw_codecs.entropy.rows import Numbers, RowContext, RowLattice
 from sw_codecs.exact_native import EXACT
 
 BLOCK_SYMBOLS = 1 << 20
 FLOAT_LATTICE = 16  # means and deviations in steps are rounded to 1/16
-Numbers = np.ndarray | Tensor
 FLOAT_DOMAIN = 1 << 22  # symbols of a block lie within this of one another
-
-
-@dataclass(frozen=True)
-class RowContext:
-    """Distributions of a block; arrays or CPU tensors.
-
-    mean, scale     [n,C]. exact: integers, base steps with 12 fractional bits; float: floats, in units of the values
-    step            [n,1]. exact: multipliers 64..16384, the step is base step * multiplier / 4096; float: the step
-    """
-
-    mean: Numbers
-    scale: Numbers
-    step: Numbers
 
 
 class ConditionalGaussian:

@@ -24,11 +24,12 @@ from splatwizard_core.api import BitstreamError
 from sw_codecs.bits import checksum, exp_golomb
 from sw_codecs.bits.packing import ByteReader, write_varint
 from sw_codecs.coders.symbol_stream import check_again, guarded
-from sw_codecs.entropy.conditional import Numbers, _array, _where
+from sw_codecs.entropy.conditional import _array, _where
 from sw_codecs.entropy.exact_tables import FRACTIONS, exact_tables
 from sw_codecs.entropy.gaussian_exact import SYMBOL_LIMIT, IntegerContext, _flat_lattice
 from sw_codecs.entropy.lattice import _tensor
 from sw_codecs.entropy.rates import gaussian_mass
+from sw_codecs.entropy.rows import Numbers, RowMixture
 from sw_codecs.exact_native import EXACT
 
 WIDTHS = np.array([4, 6, 8, 12, 16, 24, 32, 48, 64, 128, 256])
@@ -40,23 +41,6 @@ AT_ONCE = 1 << 18
 """Counts that are held together."""
 WEIGHT_BITS = 8
 FLOAT_TOTAL = 1 << 23
-
-
-@dataclass(frozen=True)
-class RowMixture:
-    """Distributions of a block; arrays or CPU tensors.
-
-    mean, scale, second_mean, second_scale      [n,C], as in `RowContext`
-    logit   [n,C] logarithm of how much likelier the first Gaussian is; exact: integers with 12 fractional bits
-    step    [n,1], as in `RowContext`
-    """
-
-    mean: Numbers
-    scale: Numbers
-    second_mean: Numbers
-    second_scale: Numbers
-    logit: Numbers
-    step: Numbers
 
 
 @dataclass(frozen=True)
@@ -251,9 +235,9 @@ def _padded_tables() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     family = exact_tables().gaussian
     radius = np.repeat(family.radius, FRACTIONS)
     zeros = np.zeros(PAD)
-    flat = np.concatenate([part for table in family.tables for part in (zeros, table.counts[:-1], zeros)])
+    flat = np.concatenate([part for counts in family.counts for part in (zeros, counts[:-1], zeros)])
     sizes = 2 * (radius + PAD) + 1
-    escapes = np.array([table.counts[-1] for table in family.tables])
+    escapes = np.array([counts[-1] for counts in family.counts])
     return flat, np.cumsum(sizes) - sizes + PAD + radius, radius, escapes
 
 
@@ -261,9 +245,9 @@ def _padded_tables() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 def _summed_tables() -> list[torch.Tensor]:
     """The tables as the kernel takes them, see exact_kernels/mixtures.h."""
     family = exact_tables().gaussian
-    sums = [np.concatenate([[0.0], np.cumsum(table.counts[:-1])]) for table in family.tables]
+    sums = [np.concatenate([[0.0], np.cumsum(counts[:-1])]) for counts in family.counts]
     first = np.cumsum([0, *(len(each) for each in sums[:-1])])
-    escapes = np.array([table.counts[-1] for table in family.tables])
+    escapes = np.array([counts[-1] for counts in family.counts])
     radius = np.repeat(family.radius, FRACTIONS)
     arrays = (np.concatenate(sums), escapes.astype(np.float64), first.astype(np.int32), radius.astype(np.int32))
     return [torch.from_numpy(each) for each in arrays]

@@ -52,8 +52,7 @@ def _share_tables(family: str) -> tuple[list[Tensor], list[np.ndarray]]:
     """The tensors, and the shares of each table int32 [K + 1]."""
     found: Family = getattr(exact_tables(), family)
     shares = []
-    for table in found.tables:
-        counts = np.asarray(table.counts, np.float64)
+    for counts in found.counts:
         before = np.concatenate([[0.0], np.cumsum(counts)])
         # docs/bitstream.md, tables of counts as models: one rounding of the division, one of each product.
         low = np.floor(before * ((float(1 << 24) - len(counts)) / before[-1])).astype(np.int64)
@@ -71,8 +70,8 @@ def _share_tables(family: str) -> tuple[list[Tensor], list[np.ndarray]]:
 @functools.cache
 def coding_model(family: str, table: int) -> Any:
     """The library's model of a table; building one takes as long as coding a few hundred symbols."""
-    counts = getattr(exact_tables(), family).tables[table].counts
-    return constriction.stream.model.Categorical(counts, perfect=False)
+    tables: Family = getattr(exact_tables(), family)
+    return constriction.stream.model.Categorical(tables.counts[table], perfect=False)
 
 
 def prefix() -> bytes:
@@ -186,7 +185,7 @@ def table_bits(family: str, symbols: np.ndarray, centre: np.ndarray, number: np.
     tables: Family = getattr(exact_tables(), family)
     offsets, found = symbols.astype(np.int64) - centre, np.empty(len(symbols))
     for table, rows in groups(number):
-        counts, radius = np.asarray(tables.tables[table].counts), int(tables.radius[table // FRACTIONS])
+        counts, radius = tables.counts[table], int(tables.radius[table // FRACTIONS])
         entry, outside, escaped = entries(offsets[rows], radius)
         found[rows] = np.log2(counts.sum() / counts[entry])
         found[rows[outside]] += 2 * (np.floor(np.log2(np.abs(escaped) - radius)) + 1)

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from splatwizard_core.api import BitstreamError
-from sw_codecs.coders.model_spec import Table
 
 LEVELS, FRACTIONS, STEPS = 64, 8, 128
 _PREFIX = struct.Struct("<4sHI")
@@ -26,11 +25,11 @@ class Family:
     """The 512 tables of one density; table number = level * 8 + fraction.
 
     radius  [64]  int64: table entries are s = -radius..radius and then the escape
-    tables        Table per number
+    counts        float64 [entries] of whole numbers, per table number
     """
 
     radius: np.ndarray
-    tables: tuple[Table, ...]
+    counts: tuple[np.ndarray, ...]
 
 
 @dataclass(frozen=True)
@@ -74,8 +73,8 @@ def parse(data: bytes) -> ExactTables:
     for _ in range(2):
         radius = take(LEVELS, "<u2")
         sizes = np.repeat(2 * radius + 2, FRACTIONS)
-        counts = take(int(sizes.sum()), "<u2") + 1
-        families.append(Family(radius, tuple(Table(c) for c in np.split(counts, np.cumsum(sizes)[:-1]))))
+        counts = (take(int(sizes.sum()), "<u2") + 1).astype(np.float64)
+        families.append(Family(radius, tuple(np.split(counts, np.cumsum(sizes)[:-1]))))
     return ExactTables(version, int.from_bytes(data[-4:], "little"), multipliers, scales, thresholds, *families)
 
 
@@ -83,3 +82,14 @@ def parse(data: bytes) -> ExactTables:
 def exact_tables() -> ExactTables:
     """The tables of this installation, read once."""
     return parse(importlib.resources.files("sw_codecs").joinpath("data/exact_tables.bin").read_bytes())
+
+
+def step_multipliers(outputs: np.ndarray) -> np.ndarray:
+    """Step multipliers 64..8192 (int64) for network outputs t with 12 fractional bits: round(4096 (1 + tanh t)).
+
+    Raises ValueError for floats: they would be cut off, and are not exact.
+    """
+    if not np.issubdtype(np.asarray(outputs).dtype, np.integer):
+        raise ValueError(f"step outputs must be integers, not {np.asarray(outputs).dtype}")
+    j = np.clip((np.asarray(outputs, np.int64) + (1 << 15)) >> 9, 0, 127)
+    return exact_tables().multipliers[j]

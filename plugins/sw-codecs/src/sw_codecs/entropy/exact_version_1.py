@@ -18,6 +18,7 @@ from splatwizard_core.api import BitstreamError
 from sw_codecs.bits import checksum, exp_golomb
 from sw_codecs.bits.packing import ByteReader
 from sw_codecs.coders.arithmetic import CHUNK, HEADER
+from sw_codecs.coders.model_spec import Table, unchecked
 from sw_codecs.coders.symbol_stream import SymbolReader, guarded
 from sw_codecs.entropy.exact_streams import SYMBOL_LIMIT, coding_model, groups
 from sw_codecs.entropy.exact_tables import FRACTIONS, Family, exact_tables
@@ -46,7 +47,7 @@ def _decode_chunk(payload: bytes | memoryview, number: np.ndarray, family: Famil
     offsets, escapes, floors = np.empty(len(number), np.int64), [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     for table, rows in groups(number):
         radius = int(family.radius[table // FRACTIONS])
-        entry = coded.get_unchecked(len(rows), family.tables[table]).astype(np.int64)
+        entry = coded.get_unchecked(len(rows), unchecked(Table, counts=family.counts[table])).astype(np.int64)
         offsets[rows] = entry - radius
         escaped = rows[entry == 2 * radius + 1]
         escapes.append(escaped)

@@ -19,7 +19,7 @@ from sw_codecs.bits.packing import ByteReader
 from sw_codecs.coders.model_spec import as_symbols
 from sw_codecs.entropy import exact_streams, exact_version_1
 from sw_codecs.entropy.exact_streams import SYMBOL_LIMIT
-from sw_codecs.entropy.exact_tables import exact_tables
+from sw_codecs.entropy.exact_tables import exact_tables, step_multipliers
 from sw_codecs.entropy.lattice import UNIT, lattice
 from sw_codecs.entropy.rates import CODER_FLOOR, gaussian_bits
 
@@ -58,17 +58,6 @@ class IntegerContext:
     mean: np.ndarray
     scale: np.ndarray
     multiplier: np.ndarray | int = UNIT
-
-
-def step_multipliers(outputs: np.ndarray) -> np.ndarray:
-    """Step multipliers 64..8192 (int64) for network outputs t with 12 fractional bits: round(4096 (1 + tanh t)).
-
-    Raises ValueError for floats: they would be cut off, and are not exact.
-    """
-    if not np.issubdtype(np.asarray(outputs).dtype, np.integer):
-        raise ValueError(f"step outputs must be integers, not {np.asarray(outputs).dtype}")
-    j = np.clip((np.asarray(outputs, np.int64) + (1 << 15)) >> 9, 0, 127)
-    return exact_tables().multipliers[j]
 
 
 Floats = FloatContext

@@ -6,7 +6,6 @@ Integer arithmetic alone, so that every machine finds the same; the formulas are
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,28 +18,6 @@ from sw_codecs.exact_native import EXACT
 
 UNIT = 4096  # 12 fractional bits
 PARAMETER_LIMIT = 1 << 48  # shifts and products below stay within 63 bits
-
-
-@dataclass(frozen=True)
-class RowLattice:
-    """Results of `lattice` for a block of n rows with C numbers, with the multipliers; made by the kernels.
-
-    centre      int32 [n,C] integer parts of means, in steps
-    number      int16 [n,C] table numbers
-    step        int64 [n,1], 64..16384
-    """
-
-    centre: Tensor
-    number: Tensor
-    step: Tensor
-
-    def present(self, present: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Centres and numbers [m] of the present ones, row after row; `present` [n,C] bool, or None: all."""
-        if present is None:
-            return self.centre.reshape(-1).numpy(), self.number.reshape(-1).numpy()
-        there = torch.from_numpy(np.ascontiguousarray(present, bool))
-        centre, number = torch.ops.sw_codecs_exact.present_rows(self.centre, self.number, there)
-        return centre.numpy(), number.numpy()
 
 
 def lattice(

@@ -1,5 +1,5 @@
 // Features of places in integers: a binary hash grid (sw_codecs.context.hash_grid) and planes
-// (sw_codecs.context.triplane).
+// (sw_cat_3dgs.triplane).
 #include "kernels.h"
 #include "rans.h"
 #include "vectors.h"

@@ -18,7 +18,7 @@ constexpr int NEIGHBORS = 12, HIDDEN = 16, RESIDUALS = 3;
 constexpr int DOWN[NEIGHBORS] = {-2, -2, -2, -2, -2, -1, -1, -1, -1, -1, 0, 0};
 constexpr int RIGHT[NEIGHBORS] = {-2, -1, 0, 1, 2, -2, -1, 0, 1, 2, -2, -1};
 constexpr int64_t MODEL_NUMBERS = HIDDEN * (NEIGHBORS + 1) + RESIDUALS * HIDDEN * (HIDDEN + 1) + 2 * (HIDDEN + 1);
-constexpr int64_t SLOPE = 288539, OFFSET = 7215259165;  // sw_codecs.context.spatial_ar
+constexpr int64_t SLOPE = 288539, OFFSET = 7215259165;  // sw_cat_3dgs.spatial_ar
 constexpr int64_t PLANE_LIMIT = 1 << 24;
 constexpr int TOGETHER = LANES == 8 ? 8 : 4;  // outputs whose sums are kept in registers
 

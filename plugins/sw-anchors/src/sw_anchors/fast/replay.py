@@ -1,0 +1,322 @@
+"""Training steps of a `CodedAnchors` as CUDA graphs, in tensors of fixed sizes.
+
+How many anchors a view sees differs from step to step. Here their rows are copied into tensors of a capacity, a few of
+which serve all views, and rows beyond the count are masked. So no shape depends on a value, and on a GPU the host
+starts values, noise, prediction, rate and the three networks with one call, and their gradients with another.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import math
+from dataclasses import dataclass
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import torch
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from splatwizard_core.api import Camera, GaussianInputs, Rasterizer
+from splatwizard_native import fast_enabled
+from sw_anchors.fast.fixed_step import (
+    PARAMETERS,
+    FixedRows,
+    PoolRows,
+    decode_rows,
+    inputs_of,
+    sample_capacity,
+)
+from sw_anchors.fast.graphs import CapturedStep, FixedStep, PlainStep, Watched, add_gradients
+from sw_anchors.fast.rows import add_rows, put_rows
+from sw_anchors.fast.seen_rows import ExpectedRows, SeenRows, capacity_of
+from sw_anchors.native import ANCHORS
+from sw_anchors.noisy_values import ENTROPY
+from sw_codecs.positions.morton import interleave
+
+log = logging.getLogger(__name__)
+
+CAPACITY_MARGIN = 1.04
+"""Head-room over the number of anchors that this camera saw last time."""
+MAX_STEPS = 16
+"""Steps kept per model; the views of one scene ask for fewer capacities."""
+
+Model = Any
+"""A `CodedAnchors`, which imports this: see `fixed_step.Model`."""
+
+
+def fits(model: Model, made_for: type) -> bool:
+    """Whether the steps of a model are replayed: in training on a GPU, if it draws Gaussians as `made_for` does."""
+    if not (fast_enabled() and model.training and torch.is_grad_enabled() and model.features.requires_grad):
+        return False
+    own = any(getattr(type(model), name) is not getattr(made_for, name) for name in _REPLACED)
+    return not own and (model in DECODERS or (model.device.type == "cuda" and ANCHORS.has_cuda()))
+
+
+_REPLACED = ("visible_anchors", "decode", "attributes")
+
+
+def gaussians(model: Model, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
+    """As `CodedAnchors.gaussians`. A view that was drawn before is decoded before the host knows how many it sees."""
+    decoder = DECODERS.get(model)
+    if decoder is None:
+        decoder = DECODERS[model] = FixedDecoder()
+    return decoder.gaussians(model, camera, rasterizer)
+
+
+def release(model: Model) -> None:
+    """Forget the steps of a model, whose graphs hold memory."""
+    DECODERS.pop(model, None)
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    """A step of one size, what it reads of the visible anchors, and of a sample of all."""
+
+    step: FixedStep
+    at: FixedRows
+    pool: PoolRows | None
+
+
+class FixedDecoder:
+    """Decodes one CodedAnchors in training. A step is prepared when its capacity is first asked for.
+
+    All are prepared anew after a change of what decides the operators (plain values of the model and of its rate model)
+    or of a tensor of the model that does not belong to single anchors (a network was replaced). Growth changes neither.
+
+    captures    how many steps were prepared, since this was made
+    """
+
+    def __init__(self, *, graphs: bool = True) -> None:
+        """graphs: as CUDA graphs; else operator by operator, on any device, which is slower than no FixedDecoder."""
+        self.captures = 0
+        self._graphs = graphs
+        self._failed = False
+        self._pool: tuple[int, int] | None = None
+        self._steps: dict[tuple[int, int], _Prepared] = {}
+        self._key: tuple[Any, ...] = ()
+        self._watched = Watched([])
+        self._shared: dict[str, Tensor] = {}
+        self._seen: WeakKeyDictionary[Camera, tuple[int, int]] = WeakKeyDictionary()  # anchors, and of how many
+        self._order: tuple[Tensor, Tensor] | None = None
+
+    def gaussians(self, model: Model, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
+        """The Gaussians of the visible anchors."""
+        places = self.expected(camera, model.num_rows)
+        with torch.no_grad():
+            order, seen = self._in_order(model, rasterizer.visible_filter(model.balls(), camera) > 0)
+            rows = SeenRows(order[seen]) if places is None else ExpectedRows(order, seen, places)
+        found = self.decode(model, camera, rows)
+        if found is None:
+            with torch.no_grad():
+                known = rows.known()
+            return model.decode(camera, known)
+        return found
+
+    def _in_order(self, model: Model, visible: Tensor) -> tuple[Tensor, Tensor]:
+        """Rows [N] int64 of all anchors, neighbours together, and whether each is visible [N].
+
+        Gradients of neighbours meet in the same cells of grids and planes: kernels add those up before they write.
+        """
+        codes = model.codes()
+        if self._order is None or self._order[0] is not codes:
+            self._order = codes, torch.argsort(interleave(codes))
+        order = self._order[1]
+        return order, visible.index_select(0, order)
+
+    def expected(self, camera: Camera, num_rows: int) -> int | None:
+        """Places for the anchors that this camera sees, of `num_rows`; None: not drawn before, or there are none.
+
+        A little more than it saw last: between two of its turns anchors grow, are pruned and change their size.
+        """
+        seen, of = self._seen.get(camera, (0, 0))
+        if self._failed or not of or not num_rows:
+            return None
+        return capacity_of(min(math.ceil(seen * num_rows / of * CAPACITY_MARGIN), num_rows))
+
+    def decode(self, model: Model, camera: Camera, rows: SeenRows) -> GaussianInputs | None:
+        """Decode the anchors `rows`: their Gaussians with opacity > 0; once more where not all had a place.
+
+        None where the GPU refused a graph or had no memory for it; that is said once.
+        """
+        found = self._decode(model, camera, rows)
+        if found is None and not rows.fit():
+            found = self._decode(model, camera, SeenRows(rows.known()))
+        if found is not None:
+            self._seen[camera] = len(found.extras["anchors"].rows), model.num_rows
+        return found
+
+    def _decode(self, model: Model, camera: Camera, rows: SeenRows) -> GaussianInputs | None:
+        """As `decode`; None too where not all have a place."""
+        if self._failed:
+            return None
+        parts = model.context_rows() if model.phase == ENTROPY else ()
+        pooled = model.RATE_OF == "all" and model.phase == ENTROPY
+        places = capacity_of(sample_capacity(model.num_rows, model.sample)) if pooled else 0
+        try:
+            prepared = self._prepared(model, parts, rows.capacity, places)
+        except RuntimeError as error:
+            self._failed = True
+            log.warning("training goes on without CUDA graphs, slower: %s", str(error).partition("\n")[0])
+        if self._failed:  # beyond the handler, whose error holds what was made until then
+            self._drop()
+            torch.cuda.empty_cache()
+            return None
+        sources = [getattr(model, name) for name in PARAMETERS]
+        at, pool = prepared.at, prepared.pool
+        with torch.no_grad():
+            at.load(model, camera, rows, parts)
+            if pool is not None:
+                pool.load(model, [source.detach() for source in sources], parts)
+        pool_rows = None if pool is None else pool.rows
+        results, others = _Decoded.found(prepared.step, rows, pool_rows, self._watched.learning, sources)
+        return inputs_of(model, at, rows, (results, others))
+
+    def _prepared(self, model: Model, parts: tuple[Tensor, ...], capacity: int, places: int) -> _Prepared:
+        rate_model = model.rate_model if model.phase == ENTROPY else None
+        parts_of_it = [] if rate_model is None else [rate_model, *vars(rate_model).values()]
+        deciding = [model, *(each for each in parts_of_it if each is rate_model or isinstance(each, nn.Module))]
+        key = (*(_plain_values(each) for each in deciding), *(part.shape[1:] for part in parts))
+        room = capacity <= self._rows_held("positions") and places <= self._rows_held("pool counted")
+        if key != self._key or not self._watched.unchanged() or not room:
+            self._drop()
+            self._key, self._watched = key, Watched.of(model, {*model.ROWS, "bounds"})
+        found = self._steps.get((capacity, places))
+        if found is None:
+            if len(self._steps) >= MAX_STEPS:
+                held = self._shared
+                self._drop()
+                self._shared = held
+            found = self._steps[capacity, places] = self._prepare(model, parts, capacity, places)
+        return found
+
+    def _prepare(self, model: Model, parts: tuple[Tensor, ...], capacity: int, places: int) -> _Prepared:
+        self.captures += 1
+
+        def rows_like(name: str, tensor: Tensor, count: int = capacity) -> Tensor:
+            if name not in self._shared:
+                self._shared[name] = tensor.new_zeros(1 << (count - 1).bit_length(), *tensor.shape[1:])
+            return self._shared[name][:count]
+
+        with torch.no_grad():
+            weights = model.mask_weights()
+            numbers = sum(model.shape.widths)
+            at = FixedRows(
+                model.features.new_zeros(()),
+                model.positions().new_zeros(3),
+                rows_like("positions", model.positions()),
+                tuple(
+                    rows_like(name, getattr(model, name).detach().flatten(1)).requires_grad_() for name in PARAMETERS
+                ),
+                None if weights is None else rows_like("weights", weights),
+                tuple(rows_like(f"part {i}", part) for i, part in enumerate(parts)),
+                rows_like("random", model.features.new_zeros(0, numbers + 1)).view(-1),
+            )
+            pool = None
+            if places:
+                counted = rows_like("pool counted", at.count.new_zeros(0), places)
+                pool = PoolRows(
+                    rows_like("pool rows", torch.zeros(0, dtype=torch.int64, device=model.device), places),
+                    counted,
+                    counted.new_zeros(()),
+                    tuple(
+                        rows_like(f"pool {name}", getattr(model, name).detach().flatten(1), places).requires_grad_()
+                        for name in PARAMETERS
+                    ),
+                    tuple(rows_like(f"pool part {i}", part, places) for i, part in enumerate(parts)),
+                    rows_like("pool random", model.features.new_zeros(0, numbers), places).view(-1),
+                )
+        compute = functools.partial(decode_rows, model, at, pool)
+        inputs = [*at.parameters, *(() if pool is None else pool.parameters), *self._watched.learning]
+        if not self._graphs:
+            return _Prepared(PlainStep(compute, inputs), at, pool)
+        with torch.cuda.device(model.device):
+            if self._pool is None:
+                self._pool = torch.cuda.graph_pool_handle()
+            return _Prepared(CapturedStep(compute, inputs, self._pool), at, pool)
+
+    def _rows_held(self, name: str) -> int:
+        """Rows of a shared tensor: without the phase that it belongs to there is none."""
+        held = self._shared.get(name)
+        return 0 if held is None else len(held)
+
+    def _drop(self) -> None:
+        """Forget all steps. Waits for the device, which may be at one."""
+        if self._steps and self._graphs:
+            torch.cuda.synchronize()
+        self._steps, self._shared, self._pool = {}, {}, None
+
+
+DECODERS: WeakKeyDictionary[Any, FixedDecoder] = WeakKeyDictionary()
+
+
+def _plain_values(holder: object) -> list[Any]:
+    """Values of an object that decide which operators run: its numbers and words."""
+    return [(name, value) for name, value in vars(holder).items() if _is_plain(value)]
+
+
+def _is_plain(value: Any) -> bool:
+    return type(value) in _PLAIN or (type(value) is tuple and all(type(each) in _PLAIN for each in value))
+
+
+_PLAIN = (bool, int, float, str)
+
+
+class _Decoded(torch.autograd.Function):
+    """Results of a FixedStep, with the gradients of rows at their places among all anchors.
+
+    Those of networks are not returned but added where the optimizer looks for them.
+    """
+
+    @classmethod
+    def found(
+        cls,
+        step: FixedStep,
+        rows: SeenRows,
+        pool: Tensor | None,
+        networks: list[Tensor],
+        sources: list[Tensor],
+    ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+        """(differentiable results, others). rows: of the visible anchors; pool: perhaps of a sample of all."""
+        counts: list[int] = []
+        found = cls.apply(step, rows, pool, networks, counts, *sources)  # type: ignore[no-untyped-call]
+        return found[: counts[0]], found[counts[0] :]
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        step: FixedStep,
+        rows: SeenRows,
+        pool: Tensor | None,
+        networks: list[Tensor],
+        counts: list[int],
+        *sources: Tensor,
+    ) -> tuple[Tensor, ...]:
+        results, others = step.forward()
+        ctx.step, ctx.networks, ctx.count, ctx.rows = step, networks, len(results), rows
+        ctx.shapes = [source.shape for source in sources]
+        ctx.save_for_backward(pool)
+        ctx.set_materialize_grads(False)
+        counts.append(len(results))
+        results, others = tuple(each.detach() for each in results), tuple(each.detach() for each in others)
+        ctx.mark_non_differentiable(*others)
+        return *results, *others
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *slopes: Tensor | None) -> tuple[Tensor | None, ...]:
+        (pool,) = ctx.saved_tensors
+        rows, count = ctx.rows, len(ctx.shapes)
+        grads = ctx.step.backward(slopes[: ctx.count])
+        add_gradients(ctx.networks, grads[count * (1 if pool is None else 2) :])
+        found = put_rows(rows.placed(), grads[:count], ctx.shapes[0][0])
+        if pool is not None:
+            own = grads[count : 2 * count]
+            found = [
+                grad.new_zeros(ctx.shapes[0][0], *grad.shape[1:]) if into is None and grad is not None else into
+                for into, grad in zip(found, own, strict=True)
+            ]
+            add_rows(pool, own, found)
+        shaped = (None if grad is None else grad.view(shape) for grad, shape in zip(found, ctx.shapes, strict=True))
+        return None, None, None, None, None, *shaped

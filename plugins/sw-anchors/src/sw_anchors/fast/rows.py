@@ -1,0 +1,156 @@
+"""Rows of anchors in a training step: kernels copy them, put them back and add noise in one pass over memory, on CUDA.
+
+Gradients are written into place: rows are taken once each, so nothing has to be summed (indexing a CUDA tensor sorts
+its index on the way back). Elsewhere the same by torch operations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from splatwizard_native import fast_enabled
+from sw_anchors.native import ANCHORS
+from sw_anchors.shape import AnchorShape
+from sw_codecs.quantizers.binary import SteMask
+
+MOST_TENSORS = 12
+"""Whose rows are copied together: `kTensors` of kernels/rows.h."""
+
+
+def fit_kernels(*tensors: Tensor) -> bool:
+    """Whether there are kernels for these tensors, of 4 bytes a number on CUDA with rows without gaps; loads them."""
+    if not tensors or len(tensors) > MOST_TENSORS:
+        return False
+    if not all(t.is_cuda and t.element_size() == 4 and t.dim() > 0 for t in tensors):
+        return False
+    contiguous = all(t.is_contiguous() or (t.dim() == 2 and t.stride(1) == 1) for t in tensors)
+    return contiguous and fast_enabled() and ANCHORS.has_cuda()
+
+
+def take_rows(rows: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
+    """Rows [S] (int64, each at most once) of each tensor; differentiable."""
+    found: tuple[Tensor, ...] = _TakeRows.apply(rows, *tensors)  # type: ignore[no-untyped-call]
+    return found
+
+
+def load_rows(rows: Tensor, sources: Sequence[Tensor], into: Sequence[Tensor]) -> None:
+    """Copy rows [V] (int64) of each source [N,...], flat, into the first V rows of its target [V or more, ...]."""
+    if fit_kernels(*sources) and fit_kernels(*into):
+        torch.ops.sw_anchors.load_rows(rows, list(sources), list(into))
+        return
+    for source, mine in zip(sources, into, strict=True):
+        flat = source if source.dim() == mine.dim() else source.flatten(1)
+        torch.index_select(flat, 0, rows, out=mine[: len(rows)])
+
+
+def put_rows(rows: Tensor, sources: Sequence[Tensor | None], count: int) -> list[Tensor | None]:
+    """For each source [V or more,...] `count` rows of zeros, of which `rows` [V] are its first V; None for None."""
+    given = [source for source in sources if source is not None]
+    if fit_kernels(*given):
+        found = iter(torch.ops.sw_anchors.scatter_rows(rows, given, count))
+        return [None if source is None else next(found) for source in sources]
+    return [
+        None if s is None else s.new_zeros(count, *s.shape[1:]).index_copy_(0, rows, s[: len(rows)]) for s in sources
+    ]
+
+
+def add_rows(rows: Tensor, sources: Sequence[Tensor | None], into: Sequence[Tensor | None]) -> None:
+    """Add row i of each float32 source [S,...] to row rows[i] of its target; a source that is None adds nothing.
+
+    rows    [S] int64, which may name one more than once; on CUDA such sums have one order where all but one of the
+            rows that are added to it are zeros
+    """
+    pairs = [(s, t) for s, t in zip(sources, into, strict=True) if s is not None and t is not None]
+    given, targets = [s for s, _ in pairs], [t for _, t in pairs]
+    if fit_kernels(*given) and fit_kernels(*targets):
+        torch.ops.sw_anchors.add_rows(rows, given, targets)
+        return
+    for source, target in pairs:
+        target.index_add_(0, rows, source)
+
+
+class _TakeRows(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, rows: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
+        ctx.save_for_backward(rows)
+        ctx.count = len(tensors[0])
+        if fit_kernels(*tensors):
+            return tuple(torch.ops.sw_anchors.take_rows(rows, list(tensors)))
+        return tuple(t.index_select(0, rows) for t in tensors)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        (rows,) = ctx.saved_tensors
+        wanted = zip(grads, ctx.needs_input_grad[1:], strict=True)
+        return None, *put_rows(rows, [grad if needed else None for grad, needed in wanted], ctx.count)
+
+
+def noisy_rows(
+    parameters: Sequence[Tensor],
+    mask_weights: Tensor | None,
+    valid: Tensor,
+    noise: Tensor | None,
+    steps: Tensor | None,
+    threshold: float,
+) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor], Tensor, Tensor]:
+    """Numbers and masks of C anchors, of which the first `valid` hold; those of others mean nothing, their masks are 0.
+
+    parameters      features [C,F], log_scales [C,6], offsets [C,3k], mask_logits [C,k]
+    mask_weights    [C,1] or None, as of `noisy_values`; `threshold` likewise
+    valid           scalar float
+    noise           [C (F+6+3k)] that the steps multiply, or None
+    steps           [C,3] or [1,3] of the groups; differentiable if [C,3]
+
+    Returns (values [C,F+6+3k], the same by group, masks [C,k], [C] whether any mask of an anchor is 1).
+    """
+    features, log_scales, offsets, logits = parameters
+    if fit_kernels(*parameters):
+        values, *groups, masks, kept = _NoisyRows.apply(*parameters, mask_weights, valid, noise, steps, threshold)  # type: ignore[no-untyped-call]
+        return values, (groups[0], groups[1], groups[2]), masks, kept
+    shape = AnchorShape(features.shape[1], logits.shape[1])
+    values = torch.cat([features, log_scales.exp(), offsets], dim=1)
+    masks = SteMask(threshold)(logits, 1.0 if mask_weights is None else mask_weights)
+    masks = masks * (torch.arange(len(logits), device=values.device) < valid).to(values)[:, None]
+    if noise is not None and steps is not None:
+        values = torch.addcmul(values, noise.view_as(values), shape.widened(steps))
+    own, scales, shifts = torch.split(values, list(shape.widths), dim=1)
+    return values, (own, scales, shifts), masks, masks.detach().amax(dim=1)
+
+
+class _NoisyRows(torch.autograd.Function):
+    """`noisy_rows` by one kernel each way."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        features: Tensor,
+        log_scales: Tensor,
+        offsets: Tensor,
+        mask_logits: Tensor,
+        mask_weights: Tensor | None,
+        valid: Tensor,
+        noise: Tensor | None,
+        steps: Tensor | None,
+        threshold: float,
+    ) -> tuple[Tensor, ...]:
+        given = (features, log_scales, offsets, mask_logits, mask_weights, valid, noise, steps)
+        values, masks, kept = torch.ops.sw_anchors.row_values(*given, threshold)
+        ctx.save_for_backward(*given)
+        ctx.set_materialize_grads(False)
+        ctx.mark_non_differentiable(kept)
+        groups = torch.split(values, [features.shape[1], 6, offsets.shape[1]], dim=1)
+        return values, *groups, masks, kept
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *slopes: Tensor | None) -> tuple[Tensor | None, ...]:
+        learns = ctx.needs_input_grad[7]
+        rows = [s if s is None or s.stride(1) == 1 else s.contiguous() for s in slopes[:5]]
+        found = torch.ops.sw_anchors.row_values_backward(*ctx.saved_tensors, rows, learns)
+        return *found[:4], None, None, None, found[4] if learns else None, None

@@ -1,0 +1,69 @@
+"""Bits of a sample of anchors under Gaussians by one kernel, which takes the derivatives on its way."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from splatwizard_native import fast_enabled
+from sw_anchors.native import ANCHORS
+
+
+def fits(*tensors: Tensor) -> bool:
+    """Whether there is a kernel for the bits of these tensors, all float32 of one device; loads it."""
+    first = tensors[0]
+    if not fast_enabled() or len({(t.device, t.dtype) for t in tensors}) > 1:
+        return False
+    if first.dtype != torch.float32:
+        return False
+    return ANCHORS.has_cuda() if first.is_cuda else first.device.type == "cpu" and ANCHORS.try_load()
+
+
+def bits_of(
+    values: Tensor,
+    mean: Tensor,
+    scale: Tensor,
+    steps: Tensor,
+    masks: Tensor,
+    counted: Tensor,
+    smallest: float,
+    smallest_scale: float,
+) -> tuple[Tensor, Tensor]:
+    """As `rate_model.bits_of`; the derivative by the bits must not be negative."""
+    given = (values, mean, scale, steps, masks, counted)
+    found: tuple[Tensor, Tensor] = _Bits.apply(*given, smallest, smallest_scale)  # type: ignore[no-untyped-call]
+    return found
+
+
+class _Bits(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        x: Tensor,
+        mean: Tensor,
+        scale: Tensor,
+        steps: Tensor,
+        masks: Tensor,
+        counted: Tensor,
+        smallest: float,
+        smallest_scale: float,
+    ) -> tuple[Tensor, Tensor]:
+        given = (each.contiguous() for each in (x, mean, scale, steps, counted, masks))
+        bits, *slopes = torch.ops.sw_anchors.sample_bits(*given, smallest, smallest_scale)
+        ctx.save_for_backward(*slopes)
+        return summed_bits(ctx, bits)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, slope: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+        return *torch._foreach_mul(ctx.saved_tensors, slope), None, None, None
+
+
+def summed_bits(ctx: Any, bits: Tensor) -> tuple[Tensor, Tensor]:
+    """(sum of bits [S,3]; the same by group [3], without gradient): what the forward of a node of bits returns."""
+    by_group = bits.sum(dim=0)
+    ctx.mark_non_differentiable(by_group)
+    return by_group.sum(), by_group

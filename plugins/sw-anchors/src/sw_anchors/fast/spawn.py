@@ -1,0 +1,87 @@
+"""Spawning of Gaussians by kernels: each is decoded, and its gradient taken, in one pass over memory.
+
+On the CPU networks and Gaussians are one kernel (`heads`); on CUDA, and where positions learn, networks are one node
+(`networks`), and the Gaussians with opacity > 0 another.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from splatwizard_native import fast_enabled
+from sw_anchors.fast import heads
+from sw_anchors.fast.networks import network_outputs
+from sw_anchors.native import ANCHORS
+from sw_anchors.neural_gaussians import Networks, NeuralGaussians
+
+
+def fits(positions: Tensor, *others: Tensor | None) -> bool:
+    """Whether there are kernels for anchors at `positions` and the other float32 tensors of `spawn`; loads them."""
+    if not fast_enabled() or any(t is not None and t.dtype != torch.float32 for t in (positions, *others)):
+        return False
+    return ANCHORS.has_cuda() if positions.is_cuda else positions.device.type == "cpu" and ANCHORS.try_load()
+
+
+def spawn(
+    center: Tensor,
+    positions: Tensor,
+    features: Tensor,
+    offsets: Tensor,
+    scales: Tensor,
+    masks: Tensor | None,
+    networks: Networks,
+) -> NeuralGaussians:
+    """As `neural_gaussians.spawn`. Waits for the device once, for the number of Gaussians."""
+    if heads.fits(positions, networks):
+        return heads.spawn(center, positions, features, offsets, scales, masks, networks)
+    outputs = network_outputs(center, positions, features, networks)
+    return visible_gaussians(*outputs, positions, offsets, scales, masks)
+
+
+def visible_gaussians(
+    alpha: Tensor,
+    geometry: Tensor,
+    color: Tensor,
+    positions: Tensor,
+    offsets: Tensor,
+    scales: Tensor,
+    masks: Tensor | None,
+) -> NeuralGaussians:
+    """Decode the Gaussians of opacity > 0 from `network_outputs`; other arguments, and the wait, as of `spawn`."""
+    opacities = alpha.detach() if masks is None else alpha.detach() * masks.detach()
+    drawn = torch.nonzero(opacities.view(-1) > 0).squeeze(1)  # [M]
+    found = _Gaussians.apply(drawn, alpha, geometry, color, positions, offsets, scales, masks)  # type: ignore[no-untyped-call]
+    return NeuralGaussians(*found, opacities, alpha.detach(), drawn)
+
+
+class _Gaussians(torch.autograd.Function):
+    """Means, opacities, scales, quaternions and colours of the Gaussians `drawn`, in one pass each way."""
+
+    @staticmethod
+    def forward(ctx: Any, drawn: Tensor, *inputs: Tensor | None) -> tuple[Tensor, ...]:
+        # Offsets and scales may be columns of a matrix: of these a row must be without gaps.
+        gaps = (None, None, None, None, (3, 1), (1,), None)
+        given = tuple(
+            t if t is None or (inner is not None and t.stride()[1:] == inner) else t.contiguous()
+            for t, inner in zip(inputs, gaps, strict=True)
+        )
+        ctx.save_for_backward(*given, drawn)
+        return tuple(torch.ops.sw_anchors.spawn(*given, drawn))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
+        positions_learn, has_masks = ctx.needs_input_grad[4], ctx.saved_tensors[6] is not None
+        contiguous = [slope.contiguous() for slope in slopes]
+        *found, to_masks, to_positions = torch.ops.sw_anchors.spawn_backward(
+            *ctx.saved_tensors, contiguous, positions_learn, torch.are_deterministic_algorithms_enabled()
+        )
+        to_alpha, to_geometry, to_color, to_offsets, to_scales = found
+        return (
+            None, to_alpha, to_geometry, to_color, to_positions if positions_learn else None, to_offsets, to_scales,
+            to_masks if has_masks else None,
+        )  # fmt: skip

@@ -1,0 +1,181 @@
+"""Rate models: what predicts how attributes of anchors are distributed, in training and for the file alike.
+
+One object, built from the same grids and networks, gives the bits of a sample in training (`rate`) and the integer
+distributions of the file (`exact`): so what is trained is what is coded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Protocol, TypeAlias
+
+from torch import Tensor
+
+from sw_anchors.fast import sample_bits
+from sw_anchors.shape import AnchorShape
+from sw_codecs.entropy.rates import gaussian_bits, lower_bound
+
+Triple = tuple[Tensor, Tensor, Tensor]
+Context = tuple[Tensor, ...]
+"""Tensors with a row per anchor, without gradients: what a rate model predicts from, known before any attribute."""
+Rows: TypeAlias = "Tensor | slice"
+"""Some rows of a context: int64 numbers, or all from one on."""
+
+SMALLEST_SCALE = 1e-9
+"""Floor of a predicted deviation, as published."""
+
+
+@dataclass(frozen=True)
+class AnchorForecast:
+    """Prediction of a rate model for V anchors, S of which are a sample whose bits are counted.
+
+    steps           [V,3] quantiser step of each group; differentiable
+    sample_steps    [S,3] those of the sample
+    outputs         [S,W] what the network says of the sample; the rate model that made them can read them
+    own_bits        scalar, differentiable: bits of all that the rate model itself stores, if it counts them here
+    """
+
+    steps: Tensor
+    sample_steps: Tensor
+    outputs: Tensor
+    own_bits: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class Floors:
+    """Floors of a rate in training.
+
+    probability     of a value
+    scale           of a predicted deviation, in quantiser steps; the gradient that would raise one from below passes.
+                    0: SMALLEST_SCALE, below which there is none
+    """
+
+    probability: float = 1e-6
+    scale: float = 0.0
+
+
+PUBLISHED_FLOORS = Floors()
+
+
+class RateModel(Protocol):
+    """Distributions of the attributes of anchors.
+
+    A method's own class holds its grids and networks. `CodedAnchors.rate_model` gives it in training, the encoder asks
+    the trained model for it, and the decoder builds it from the file.
+    """
+
+    def forecast(self, context: Context, sample: Rows) -> AnchorForecast:
+        """Return quantiser steps of the anchors of `context`, and what `rate` needs of its rows `sample`.
+
+        Differentiable; shapes depend on no value, and nothing waits for the device.
+        """
+        ...
+
+    def rate(self, values: Tensor, forecast: AnchorForecast, masks: Tensor, counted: Tensor) -> tuple[Tensor, Tensor]:
+        """Return (bits of the sample, a differentiable scalar; the same by group [3], without gradient).
+
+        values      [S,C] noisy values of all groups side by side, in the order of `shape.GROUPS`
+        masks       [S,k] 0 or 1, differentiable
+        counted     [S] 1 where an anchor counts, else 0
+        """
+        ...
+
+    def exact(self) -> object:
+        """Return the same distributions in integers, equal on every machine: what the method's file is coded with."""
+        ...
+
+
+@dataclass(frozen=True)
+class AnchorContext:
+    """Distributions of the attributes of V anchors: a triple for each of `shape.GROUPS`, in the units of the values.
+
+    means, scales   [V,C] of each group: mean and standard deviation of every number; scales may be <= 0
+    steps           [V,1] of each group: quantiser step of the anchor
+    """
+
+    means: Triple
+    scales: Triple
+    steps: Triple
+
+
+@dataclass(frozen=True)
+class AnchorRate:
+    """Rate of a training step; `RenderResult.extras["rate"]` in the entropy phase.
+
+    bits        scalar, differentiable: bits per number over the sample, times the share of visible anchors that are
+                kept where the sample is of those; 0 for an empty sample
+    by_group    [3] bits of features, scales and offsets in the sample, detached
+    numbers     scalar: how many numbers the sample has
+    own_bits    of the rate model
+    """
+
+    bits: Tensor
+    by_group: Tensor
+    numbers: Tensor
+    own_bits: Tensor | None = None
+
+    @classmethod
+    def of(cls, bits: Tensor, by_group: Tensor, numbers: Tensor, forecast: AnchorForecast) -> AnchorRate:
+        """Return the rate of a sample of so many bits and numbers."""
+        return cls(bits / numbers.clamp(min=1), by_group, numbers, forecast.own_bits)
+
+
+def gaussian_rate(
+    values: Tensor, mean: Tensor, scale: Tensor, steps: Tensor, masks: Tensor, counted: Tensor, floors: Floors
+) -> tuple[Tensor, Tensor]:
+    """Return the bits of S anchors under Gaussians, as `RateModel.rate` does.
+
+    values, mean, scale     [S,F+6+3k]
+    steps                   [S,3] widths of the bins by group
+    masks                   [S,k] factors of the bits of an offset
+    counted                 [S] factors of the bits of all other numbers
+
+    The derivative by the bits must not be negative.
+    """
+    if floors.scale:
+        scale = floored(scale, _shape(values, masks).widened(steps), floors)
+    count = sample_bits.bits_of if sample_bits.fits(values, mean, scale, steps, masks, counted) else bits_of
+    return count(values, mean, scale, steps, masks, counted, floors.probability, SMALLEST_SCALE)
+
+
+def bits_of(
+    values: Tensor,
+    mean: Tensor,
+    scale: Tensor,
+    steps: Tensor,
+    masks: Tensor,
+    counted: Tensor,
+    smallest: float,
+    smallest_scale: float,
+) -> tuple[Tensor, Tensor]:
+    """Return what `gaussian_rate` returns.
+
+    smallest        probability of a value
+    smallest_scale  deviations below it are taken for it, without a gradient
+    """
+    shape = _shape(values, masks)
+    bits = gaussian_bits(values, mean, scale.clamp(min=smallest_scale), shape.widened(steps), p_min=smallest)
+    bits = bits * shape.joined(counted[:, None], counted[:, None], masks)
+    return bits.sum(), shape.sums(bits.detach())
+
+
+def _shape(values: Tensor, masks: Tensor) -> AnchorShape:
+    k = masks.shape[1]
+    return AnchorShape(values.shape[1] - 6 - 3 * k, k)
+
+
+def floored(scale: Tensor, steps: Tensor, floors: Floors) -> Tensor:
+    """Keep predicted deviations [S,C] to their floor, for quantiser steps [S,C]; differentiable.
+
+    Of a column whose deviations are all at SMALLEST_SCALE no value lies where a gradient would tell: none learns.
+    """
+    if floors.scale:
+        return lower_bound(scale, floors.scale * steps.detach())
+    return scale.clamp(min=SMALLEST_SCALE)
+
+
+def triple(parts: Iterable[Tensor]) -> Triple:
+    """Return tensors of the three groups in their order."""
+    first, second, third = parts
+    return first, second, third

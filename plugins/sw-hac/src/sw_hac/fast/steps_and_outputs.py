@@ -1,0 +1,103 @@
+"""Steps of all anchors and outputs for a sample as one node: the wide layer is computed for the sample alone.
+
+All anchors that a view sees need their quantiser steps; distributions are for those whose bits are counted.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from sw_anchors.fast.predicted_steps import steps_by_torch, steps_fit_kernel
+from sw_anchors.native import ANCHORS
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from splatwizard_native import fast_enabled
+from sw_hac.config import SMALLEST_STEP
+
+OFFSET = 1.0
+"""A step is its base times OFFSET + tanh(t), at least SMALLEST_STEP (`rate_model.steps_of`)."""
+
+
+def fits(features: Tensor) -> bool:
+    """Whether features [V,I] are float32 of a device with kernels; loads these."""
+    if not fast_enabled() or features.dtype != torch.float32:
+        return False
+    return ANCHORS.has_cuda() if features.is_cuda else features.device.type == "cpu" and ANCHORS.try_load()
+
+
+def steps_and_outputs(
+    features: Tensor, network: nn.Sequential, base: Tensor, sample: Tensor | slice, start: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """As `rate_model.steps_and_outputs`."""
+    first, _, last = network
+    found: tuple[Tensor, Tensor, Tensor] = _StepsAndOutputs.apply(  # type: ignore[no-untyped-call]
+        features, first.weight, first.bias, last.weight, last.bias, base, sample, slice(start, start + 3)
+    )
+    return found
+
+
+class _StepsAndOutputs(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        features: Tensor,
+        first: Tensor,
+        first_bias: Tensor,
+        last: Tensor,
+        last_bias: Tensor,
+        base: Tensor,
+        sample: Tensor | slice,
+        part: slice,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        features, *parameters, base = (
+            t.contiguous() for t in (features, first, first_bias, last[part], last_bias[part], base)
+        )
+        by_kernel = steps_fit_kernel(features, *parameters, base)
+        form = torch.ops.sw_anchors.predicted_steps if by_kernel else steps_by_torch
+        steps, hidden, tangents = form(features, parameters, base, OFFSET, SMALLEST_STEP)
+        own = hidden[sample] if isinstance(sample, slice) else hidden.index_select(0, sample)
+        rows = None if isinstance(sample, slice) else sample
+        ctx.save_for_backward(features, first, first_bias, last, last_bias, base, hidden, tangents, own, rows)
+        ctx.sample, ctx.part, ctx.by_kernel = sample, part, by_kernel
+        of_sample = steps[sample].clone() if rows is None else steps.index_select(0, rows)
+        return steps, of_sample, torch.addmm(last_bias, own, last.t())
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, to_steps: Tensor, to_own: Tensor, to_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        features, first, first_bias, last, last_bias, base, hidden, tangents, own, rows = ctx.saved_tensors
+        part = ctx.part
+        to_last, to_last_bias = torch.mm(to_outputs.t(), own), to_outputs.sum(dim=0)
+        to_steps = _plus(to_steps.clone(), ctx.sample, to_own)
+        if ctx.by_kernel:
+            to_hidden = _plus(torch.zeros_like(hidden), ctx.sample, torch.mm(to_outputs, last))
+            parameters = [t.contiguous() for t in (first, first_bias, last[part], last_bias[part])]
+            to_features, to_first, to_first_bias, *of_steps = torch.ops.sw_anchors.predicted_steps_backward(
+                features, parameters, base, OFFSET, SMALLEST_STEP, hidden, tangents, to_steps.contiguous(), to_hidden
+            )
+            to_last[part] += of_steps[0]
+            to_last_bias[part] += of_steps[1]
+        else:
+            to_tangents = torch.ops.aten.tanh_backward(to_steps * base, tangents)
+            to_tangents *= tangents >= SMALLEST_STEP - OFFSET
+            to_hidden = torch.mm(to_tangents, last[part])
+            if rows is None:
+                to_hidden[ctx.sample].addmm_(to_outputs, last)
+            else:
+                to_hidden.index_add_(0, rows, torch.mm(to_outputs, last))
+            torch.ops.aten.threshold_backward.grad_input(to_hidden, hidden, 0, grad_input=to_hidden)
+            to_last[part].addmm_(to_tangents.t(), hidden)
+            to_last_bias[part] += to_tangents.sum(dim=0)
+            to_features, to_first = torch.mm(to_hidden, first), torch.mm(to_hidden.t(), features)
+            to_first_bias = to_hidden.sum(dim=0)
+        return to_features, to_first, to_first_bias, to_last, to_last_bias, None, None, None
+
+
+def _plus(into: Tensor, sample: Tensor | slice, source: Tensor) -> Tensor:
+    """Add rows of a source [S,...] to the rows `sample` of a tensor, in place; return it."""
+    if isinstance(sample, slice):
+        into[sample] += source
+        return into
+    return into.index_add_(0, sample, source)
