@@ -1,8 +1,9 @@
 """Hyper-parameters of 2DGS, by default those of the authors' code; what it chooses by data set is unset here."""
 
 from pydantic import Field
-from sw_gaussians.choices import CodecChoice, DensityChoice
+from sw_gaussians.choices import CodecChoice
 from sw_gaussians.config import GaussianTraining
+from sw_gaussians.density.choice import DensityChoice
 from sw_gaussians.start import Rotation
 from sw_gaussians.surface_losses import NormalTerm
 

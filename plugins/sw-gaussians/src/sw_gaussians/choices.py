@@ -16,7 +16,7 @@ from pydantic import BaseModel, Field, ValidationError, create_model, model_vali
 from splatwizard_core.api import ConfigError, OptimizationParams, Params, PluginError, apply_overrides, given_values
 
 if TYPE_CHECKING:
-    from splatwizard_core.api import DensityControl, GaussianCodec, PluginManager, Pruner
+    from splatwizard_core.api import GaussianCodec, PluginManager, Pruner
 
 ChoiceT = TypeVar("ChoiceT", bound="Choice")
 ExchangeableT = TypeVar("ExchangeableT", bound="Exchangeable")
@@ -167,32 +167,6 @@ class PrunerChoice(Choice):
         self.provider(plugins, key)
         pruner: Pruner = plugins.pruners.load(self.pruner)(**self.settings)
         return pruner
-
-
-class DensityChoice(Choice):
-    """Density control: how Gaussians come and go while they train."""
-
-    REGISTRY: ClassVar[str] = "density_controls"
-
-    name: str = Field("adc", description="density control: any registered one")
-    settings: dict[str, object] = Field({}, description="settings of the chosen one, by its own keys")
-
-    def load(self, plugins: PluginManager) -> DensityControl:
-        """Return the control with its settings. Raises ConfigError if it is not installed, PluginError."""
-        self.provider(plugins, "density.name")
-        control: DensityControl = plugins.density_controls.load(self.name)(**self.settings)
-        return control
-
-    def usual(self) -> DensityControl:
-        """Return that of 3DGS, for a stage whose method hands none on; raise PluginError if another one is chosen."""
-        from sw_gaussians.density.adc import AdaptiveDensityControl
-
-        if self.name != "adc":
-            raise PluginError(
-                f"density={self.name} does not reach the training: the author of its method has to make the stage with "
-                "ThreeDGSStage(config, config.density.load(plugins))"
-            )
-        return AdaptiveDensityControl(**self.settings)
 
 
 class Moved(NamedTuple):

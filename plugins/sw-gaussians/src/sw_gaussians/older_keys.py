@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from splatwizard_core.api import ConfigError
-from sw_gaussians.choices import DensityChoice, Moved
+from sw_gaussians.choices import Moved
+from sw_gaussians.density.choice import DensityChoice
 
 _SHARED = (
     "start", "stop", "interval", "grad_threshold", "percent_dense", "min_opacity", "reset_interval", "reset_opacity",
