@@ -311,12 +311,11 @@ def timed(method: str, args: argparse.Namespace, gpu: str) -> dict[str, Any]:
 
 def operations(device: str) -> dict[str, Callable[[], list[Tensor]]]:
     """Name -> () -> tensors whose bits must be equal each time; sizes of a real step."""
-    from sw_anchors.fast.fixed_step import sample_of
-    from sw_anchors.fast.fused_ops import add_rows
+    from sw_anchors.fast.fixed_step import bernoulli_rows, sample_of
     from sw_anchors.fast.networks import network_outputs
-    from sw_anchors.fast.pool_rows import bernoulli_rows
+    from sw_anchors.fast.rows import add_rows
     from sw_anchors.fast.seen_rows import ExpectedRows
-    from sw_anchors.neural_gaussians import visible_gaussians
+    from sw_anchors.fast.spawn import visible_gaussians
     from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_scene
 
     from splatwizard_core.api import RasterOptions, photometric_loss

@@ -35,7 +35,7 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any
 from unittest import mock
@@ -47,7 +47,7 @@ os.environ.setdefault("TEARDOWN_CUPTI", "0")
 import torch
 from scene_names import FORMS, split_scene
 from step_parts import SECTION, kernel_times, longest_kernels, report
-from sw_anchors.fast import fused_ops, mixture_bits, view_networks
+from sw_anchors.fast import networks, replay, rows, sample_bits
 from torch.profiler import ProfilerActivity, profile, record_function
 
 from splatwizard_core.gaussians.inputs import rgb_to_dc
@@ -74,18 +74,18 @@ PARTS = {
     "rasterizer.render": "rasterizer",
     "rasterizer.visible_filter": "visibility",
     "model.gaussians": "decoding",
-    "model._draws": "noise",
-    "model.forecast": "context MLPs",
+    "model.draw_noise": "noise",
     "model.mlp_opacity.forward": "anchor MLPs",
     "model.mlp_cov.forward": "anchor MLPs",
     "model.mlp_color.forward": "anchor MLPs",
     "model.context.network.forward": "context MLPs",
     "model.context.slices.forward": "context MLPs",
-    "model._looked_up": "grid or planes",
+    "model.grid.with_bits": "grid or planes",
     "model.context.triplane.forward": "grid or planes",
     "model.context_rows": "grid or planes",
     "model.context.triplane_bits": "planes' rate",
-    "model.rate": "rate",
+    "model._with_rate_of_visible": "rate",
+    "model._with_rate_of_all": "rate",
     "stage.loss": "loss",
     "pre.exec": "plan before",
     "post.exec": "plan after",
@@ -141,11 +141,16 @@ class Summary:
 def kernels_off() -> Iterator[None]:
     """Do without the kernels of rows and planes, as before there were any."""
     with ExitStack() as stack:
-        for module in (fused_ops, plane_kernels, plane_sites):
+        for module in (rows, plane_kernels, plane_sites):
             stack.enter_context(mock.patch.object(module, "fit_kernels", return_value=False))
-        stack.enter_context(mock.patch.object(view_networks, "fit_kernel", return_value=False))
-        stack.enter_context(mock.patch.object(mixture_bits, "bits_fit_kernel", return_value=False))
+        stack.enter_context(mock.patch.object(networks, "fits_kernel", return_value=False))
+        stack.enter_context(mock.patch.object(sample_bits, "fits", return_value=False))
         yield
+
+
+def graphs_as(wanted: bool) -> AbstractContextManager[Any]:
+    """Replay steps as CUDA graphs, or do not."""
+    return nullcontext() if wanted else mock.patch.object(replay, "fits", return_value=False)
 
 
 @dataclass
@@ -272,7 +277,6 @@ def anchors(
     # The plan of a preset is for its own number of steps: scaled, it is that of a longer run, which ends at `last`.
     nominal = round(last / planned.iterations * cls.Config.FULL_ITERATIONS)
     sets: dict[str, Any] = {"iterations": nominal, "scale_schedule": True, "seed": args.seed}
-    sets["graphs"] = graphs
     sets |= {"images": pictures} if pictures else {}
     resolved = resolve(cls, args.preset, sets=sets, scene=folder)
     if (folder, pictures) not in scenes:
@@ -308,13 +312,14 @@ def anchors(
                 watch.begin()
             trainer.run(last, watch)
 
-        with_pictures(scene, session.device, run)
+        with graphs_as(graphs):
+            with_pictures(scene, session.device, run)
     count = round(sum(int(d) for d in drawn) / max(len(drawn), 1))
     print(
         f"  {method}, {last:,} steps of preset {args.preset}, {trainer.state.model.num_rows:,} anchors, {count:,} drawn"
     )
     peak = math.nan
-    cuda, prepared = session.device.type == "cuda", getattr(trainer.state.model, "fixed", None)
+    cuda, prepared = session.device.type == "cuda", replay.DECODERS.get(trainer.state.model)
     if cuda:
         said = f"{prepared.captures} captures" if prepared is not None else "off"
         peak = torch.cuda.max_memory_allocated() / 1e9

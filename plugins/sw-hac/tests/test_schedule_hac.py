@@ -99,9 +99,8 @@ def test_every_preset_resolves_and_ends_in_the_entropy_phase():
         assert max(steps_of(stage, "adjust anchor")) < config.iterations
 
 
-def test_how_a_step_starts_and_cells_that_are_whole_voxels_anyway_tell_no_trainings_apart():
+def test_cells_that_are_whole_voxels_anyway_tell_no_trainings_apart():
     plain = resolve(HAC, "paper").training_hash()
-    assert resolve(HAC, "paper", sets={"graphs": False}).training_hash() == plain
     assert resolve(HAC, "paper", sets={"growth.subvoxel": True}).training_hash() == plain
     fractions = [resolve(HAC, "paper", sets={"growth.init_factor": 4, "growth.subvoxel": on}) for on in (False, True)]
     assert len({each.training_hash() for each in fractions} | {plain}) == 3

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 from pydantic import Field
 from sw_gaussians.pictures import Pictures
 
-from splatwizard_core.api import OptimizationParams, Params, SameResult
+from splatwizard_core.api import OptimizationParams, Params
 
 RANDOM_START: Mapping[str, Any] = {
     "init_points": 100_000,
@@ -120,6 +120,3 @@ class CodedAnchorParams(AnchorParams):
     ABSENT: ClassVar[Mapping[str, Any]] = {"growth.subvoxel": True}
 
     lr: CodedAnchorLearningRates = Field(CodedAnchorLearningRates(), description="step sizes")
-    graphs: Annotated[bool, SameResult()] = Field(
-        True, description="on a GPU, start the decoding of a step as a CUDA graph"
-    )

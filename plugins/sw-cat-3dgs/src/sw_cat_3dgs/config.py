@@ -130,7 +130,7 @@ class CatConfig(Choosing, CodedAnchorParams):
     FULL_ITERATIONS: ClassVar[int] = FULL_RUN
     OLDER: ClassVar[Mapping[str, Moved]] = {
         f"codec.{name}": Moved((f"codec.settings.{name}",)) for name in FileSettings.model_fields
-    }
+    } | {"graphs": Moved(())}
 
     iterations: int = Field(FULL_RUN, ge=1, description="steps; plans keep their ranges, tasks past the end never fire")
     bound_margin: Literal["hac", "extent", "none"] = Field(

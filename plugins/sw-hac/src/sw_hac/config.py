@@ -129,6 +129,6 @@ class HACConfig(Choosing, HACParams):
 
     OLDER: ClassVar[Mapping[str, Moved]] = {
         f"codec.{name}": Moved((f"codec.settings.{name}",)) for name in FileSettings.model_fields
-    }
+    } | {"graphs": Moved(())}
 
     codec: Codec = Field(Codec(), description="what writes the file")
