@@ -183,6 +183,7 @@ def test_names_from_strangers_stay_text(make_run, make_curve, tmp_path):
         assert HOSTILE in found.text
 
 
+@pytest.mark.usefixtures("advice_as_installed")
 def test_advice_on_the_page_is_that_of_the_terminal(make_run):
     """None of our packages is on an index: what is shown names the checkout, or the wheels, that this came from."""
     advice = "weights-missing: pip install 'sw-metrics[lpips]'"
