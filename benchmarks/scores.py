@@ -19,7 +19,6 @@ import torch
 from sw_reference.testing.raster_scenes import cast_inputs, with_tensors
 
 from splatwizard_core.api import RasterOptions, ScoreSpec
-from sw_rasterizers.scoring import PupRasterizer
 from sw_rasterizers.standard import StandardRasterizer
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -87,7 +86,7 @@ def main() -> None:
     one, both = measure(forward), measure(forward_and_backward)
     print(f"{'forward of standard':34} {1e3 * one:8.2f} ms\n{'forward and backward':34} {1e3 * both:8.2f} ms")
     for name, options in REQUESTS.items():
-        seconds = measure(lambda options=options: PupRasterizer().accumulate(g, views, options)) / len(views)
+        seconds = measure(lambda options=options: StandardRasterizer().accumulate(g, views, options)) / len(views)
         ratios = f"{seconds / one:5.2f} of forward {seconds / both:5.2f} of both"
         print(f"{name:34} {1e3 * seconds:8.2f} ms {ratios}")
 

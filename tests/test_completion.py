@@ -58,7 +58,7 @@ def offered(line: str, incomplete: str = "") -> list[str]:
         ("bench --method", "3", ["3dgs"]),
         ("bench --executor", "lo", ["local"]),
         ("bench", "plan", ["<file>"]),
-        ("run --set", "densify.ab", ["densify.absgrad="]),
+        ("run --set", "density.settings.ab", ["density.settings.absgrad="]),
         ("run --method hac,lightgaussian --set", "growth.init", ["growth.init_factor="]),
         ("run --method nobody --set", "see", ["seed="]),
         ("eval x.swz --set", "reso", ["resolution="]),

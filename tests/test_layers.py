@@ -158,7 +158,6 @@ FAMILIES = {"sw_hac_plus": "sw_hac"}
 SHELVES = {"sw_rasterizers", "sw_codecs", "sw_gaussians", "sw_anchors", "sw_reference"}
 """Libraries for methods: what stands there serves two families, or can be chosen by name."""
 FOR_ONE = {
-    "sw_gaussians.baking": "makes explicit Gaussians of a model for sw-view, and knows the parts of GaussianModel",
     "sw_gaussians.bake_refining": "trains on pictures that sw-view gives it, with the stage of sw-gaussians",
 }
 """Module of a library that one family alone reaches -> why it is there; at most ten in the end."""

@@ -22,7 +22,7 @@ def settings(block: Params, prefix: str = ""):
         value = getattr(block, name)
         if isinstance(block, Choice) and name == "settings":
             model = getattr(block.provider(load_plugins(), prefix), "Settings", None)
-            yield from settings(model(), f"{prefix}settings.") if model is not None else ()
+            yield from settings(model(**value), f"{prefix}settings.") if model is not None else ()
         elif isinstance(value, Params):
             yield from settings(value, f"{prefix}{name}.")
         else:

@@ -45,7 +45,7 @@ from splatwizard_core.scene.dataset import SceneOptions
 from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.scene.scene import Scene
 from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.scheduler import Scheduler, build_schedulers
+from splatwizard_core.training.scheduler import Scheduler, build_schedulers, format_plan
 from sw_codecs import testing
 
 CPU = torch.device("cpu")
@@ -226,6 +226,18 @@ def test_register_tasks(plugins, scene, model):
         assert context.log.said[-1] == ("prune", f"{left} Gaussians go")
     assert model.num_rows == 8
     assert context.log.scalars["pruned"] == 0
+
+
+def test_register_density_controls(plugins, scene, tmp_path):
+    sets = {"density": "crowding", "density.settings.start": 1, "density.settings.interval": 2}
+    method = create_method(plugins, "3dgs", {**sets, "iterations": 6})
+    assert method.config.density.settings == {"start": 1, "stop": 15_000, "interval": 2, "share": 0.05}
+    assert "adjust density" in format_plan(*build_schedulers(method.stages()[0], PipelineParams()))
+    start = method.create_model(scene, torch.Generator()).num_rows
+    trained = train_with(method.stages(), lambda: method.create_model(scene, torch.Generator()), scene)
+    assert trained.num_rows == start + 3 * int(0.05 * start)
+    with pytest.raises(ConfigError, match=r"did you mean .density\.settings\.share"):
+        create_method(plugins, "3dgs", {"density": "crowding", "density.settings.shre": 1})
 
 
 def test_register_methods(plugins, scene, tmp_path):

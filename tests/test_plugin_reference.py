@@ -30,6 +30,7 @@ CONTRACTS: dict[str, list[Any]] = {
     "register_entropy_models": [api.EntropyModel],
     "register_context_models": [api.ContextModel],
     "register_coders": [api.EntropyCoder, api.PositionCodec, api.ArrayCoder, api.VectorCoder, api.GaussianCodec],
+    "register_density_controls": [api.DensityControl],
     "register_methods": [api.Method],
     "register_datasets": [api.Dataset],
     "register_metrics": [MetricFactory],

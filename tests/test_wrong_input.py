@@ -71,7 +71,7 @@ ROWS = [
     Row("run --scene demo:tiny --method 3dgs", "no method is called '3dgs'", env={"SW_PLUGINS": ""}),
     # Keys and values.
     Row("run --set itertions=3", "unknown key 'itertions' in --set: did you mean 'iterations'?"),
-    Row("train --set densify.grad_treshold=1", "did you mean 'densify.grad_threshold'?"),
+    Row("train --set densify.grad_treshold=1", "did you mean 'density.settings.grad_threshold'?"),
     Row("schedule 3dgs --set lr.opacty=1", "did you mean 'lr.opacity'?"),
     Row("schedule 3dgs --set lr.xyzzy=1", "'lr' has max_steps, opacity, position_delay_mult"),
     Row("info demo:tiny --set resolutoin=3", "did you mean 'resolution'?"),
@@ -113,7 +113,7 @@ ROWS = [
     Row("run --config {broken.toml}", "broken.toml is not valid TOML: "),
     Row("run --config {binary.toml}", "binary.toml is not valid TOML: "),
     Row("train --config {typo.toml}", "unknown key 'itertions' in {typo.toml}: did you mean 'iterations'?"),
-    Row("train --config {deep.toml}", "did you mean 'densify.grad_threshold'?"),
+    Row("train --config {deep.toml}", "did you mean 'density.settings.grad_threshold'?"),
     Row("run --config {value.toml}", "bad value -3 for 'iterations' in {value.toml}"),
     Row("run --config {name.toml}", "expected a name"),
     Row("train --config {other.toml} --rate r2", "was written for rate 'r1', not 'r2'"),

@@ -27,7 +27,12 @@ def generate() -> str:
     if broken:
         raise SystemExit("cannot catalogue what does not load: " + "; ".join(broken))
     found = {
-        kind: {e.name: e.distribution for e in registry if is_ours(e.distribution) and e.distribution != CORE}
+        kind: {
+            name: e.distribution
+            for e in registry
+            if is_ours(e.distribution) and e.distribution != CORE
+            for name in (e.name, *e.declared.get("aliases", ()))
+        }
         for kind, registry in plugins.registries.items()
     }
     defaults = {kind: registry.default for kind, registry in plugins.registries.items()}

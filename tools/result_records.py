@@ -103,11 +103,13 @@ def extract(run: Path, plugins: PluginManager, repetition: int = 0) -> SmallReco
     memory = quiet.get("memory") or record.memory.model_dump()
     served, entries = (
         sorted(set(record.rasterizers.get("render", {}).values())),
-        {e.name: e for e in plugins.rasterizers},
+        {name: plugins.rasterizers.entry(name) for name in plugins.rasterizers.names},
     )
     noted = speed.get("drawn_by")  # not by older releases
     default: Mapping[str, float] = speed.get("default_fps") or {}
-    drawn = _drawn(noted or {n: entries[n].declared.get("kernels") or n if n in entries else n for n in served})
+    drawn = _drawn(
+        noted or {n: entries[n].declared.get("kernels") or entries[n].name if n in entries else n for n in served}
+    )
     stages = create_method(plugins, record.method).stages()
     start = stages[0].starts_from
     train, environment = record.train, record.environment

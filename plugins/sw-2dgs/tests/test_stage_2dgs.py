@@ -4,8 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from sw_gaussians.budget import densify_to_budget
-from sw_gaussians.fast_tasks import DensifyToBudget
+from sw_gaussians.density.budget import densify_to_budget
 from sw_gaussians.ply import export_ply
 from sw_gaussians.start import gaussians_from_points, surfels_from_points
 from sw_gaussians.surfels import Surface, SurfelModel
@@ -66,7 +65,7 @@ def test_the_plan_is_that_of_the_authors_code():
     pre, post = build_schedulers(stage, PipelineParams())
     assert format_plan(pre, post, total=stage.iterations) == PLAN
     assert stage.starts_from is None
-    assert stage.densification().settings["min_opacity"] == 0.05
+    assert stage.control.min_opacity(stage.config.lr.opacity) == 0.05
 
 
 def test_on_a_cpu_surfels_are_drawn_by_the_same_kernel_with_deterministic_sums():
@@ -89,7 +88,8 @@ def test_on_a_cpu_surfels_are_drawn_by_the_same_kernel_with_deterministic_sums()
 
 
 def least_opacity(**values) -> float:
-    return TwoDGSStage(configured(**values)).densification().settings["min_opacity"]
+    stage = TwoDGSStage(configured(**values))
+    return stage.control.min_opacity(stage.config.lr.opacity)
 
 
 def test_a_plan_too_short_to_recover_from_a_reset_prunes_below_it():
@@ -192,28 +192,15 @@ def test_the_loss_is_the_photometric_one_plus_the_weighted_parts():
     assert model.log_scales.grad.shape == (200, 2)
 
 
-def test_relocation_is_refused():
-    with pytest.raises(ConfigError, match=r"mcmc\.enabled"):
-        TwoDGSStage(configured(mcmc__enabled=True))
+def stage_with(density: str, **values) -> TwoDGSStage:
+    config = configured(density=density, **values).completed(load_plugins(), {})
+    return TwoDGSStage(config, config.density.load(load_plugins()))
 
 
-def test_a_score_that_no_rasterizer_of_surfels_has_is_refused_at_once():
-    with pytest.raises(ConfigError, match=r"set fast\.score=gradient"):
-        TwoDGSStage(configured(fast__densify="budget"))
-
-
-@pytest.mark.parametrize("key", ["fast.veto_views", "fast.late_prune"])
-def test_what_counts_pixels_is_refused_at_once(key):
-    with pytest.raises(ConfigError, match=key):
-        TwoDGSStage(configured(fast__densify="budget", fast__score="gradient", **{key: 2 if "views" in key else True}))
-
-
-def test_a_budget_prunes_below_a_reset_as_plain_density_control_does():
-    for values in ({}, {"iterations": 9_000, "scale_schedule": True}):
-        stage = TwoDGSStage(configured(fast__densify="budget", fast__score="gradient", **values))
-        _, post = build_schedulers(stage, PipelineParams())
-        (task,) = (entry.task for entry in post.registrations if isinstance(entry.task, DensifyToBudget))
-        assert task.min_opacity == stage.min_opacity() == (0.005 if values else 0.05)
+@pytest.mark.parametrize(("density", "said"), [("mcmc", "density=mcmc"), ("budget", r"settings\.score=gradient")])
+def test_what_surfels_do_not_have_is_refused_before_a_step(density, said):
+    with pytest.raises(ConfigError, match=said):
+        begun(stage_with(density), scene_of())
 
 
 def test_a_budget_grows_surfels():

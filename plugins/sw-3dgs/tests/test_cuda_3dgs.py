@@ -4,10 +4,9 @@ import math
 
 import pytest
 import torch
-from sw_gaussians import fragments
-from sw_gaussians.config import MCMC
-from sw_gaussians.fused_adam import FusingOptimizer
-from sw_gaussians.mcmc import draw
+from sw_gaussians.density import fragments
+from sw_gaussians.density.mcmc import draw
+from sw_gaussians.fast.fused_adam import FusingOptimizer
 from sw_gaussians.native import GAUSSIANS
 from sw_gaussians.stage import ThreeDGSStage
 from sw_gaussians.start import gaussians_from_points
@@ -48,8 +47,11 @@ def small_scene(channels: int) -> Scene:
     return Scene("small", views, views[:1], points, Protocol("toy"))
 
 
-def make_trainer(scene: Scene, config: ThreeDGSConfig | None = None, **settings) -> Trainer:
-    stage = ThreeDGSStage(config or ThreeDGSConfig(iterations=7000))
+def make_trainer(
+    scene: Scene, config: ThreeDGSConfig | None = None, *, fuses: bool | None = False, **settings
+) -> Trainer:
+    config = config or ThreeDGSConfig(iterations=7000)
+    stage = ThreeDGSStage(config, config.density.load(load_plugins()), fuses_updates=fuses)
     ppl, streams = PipelineParams(device="cuda", **settings), Streams(0)
     rasterizer = NegotiatedRasterizer(load_plugins(), device="cuda")
     assert scene.points is not None
@@ -71,17 +73,16 @@ def test_a_step_between_densifications_waits_for_nothing_that_torch_sees(channel
 @pytest.mark.parametrize(
     "settings",
     [
-        {"mcmc": MCMC(enabled=True)},
-        {"sparse_adam": "none"},
-        {"sparse_adam": "per_row"},
-        {"fast": {"densify": "budget"}},
+        {"density": "mcmc"},
+        {"sparse_adam": True},
+        {"density": "budget"},
     ],
-    ids=["mcmc", "sparse", "sparse-per-row", "fast"],
+    ids=["mcmc", "sparse", "fast"],
 )
 def test_nor_does_it_with_noise_sparse_updates_or_opacity_gradients(settings):
     scene = small_scene(3)
     assert keep_pictures(scene.train, "cuda")
-    waits_for_nothing(make_trainer(scene, ThreeDGSConfig(iterations=7000, **settings)))
+    waits_for_nothing(make_trainer(scene, ThreeDGSConfig.model_validate({"iterations": 7000, **settings})))
     keep_pictures(scene.train, "cpu")
 
 
@@ -100,19 +101,21 @@ def waits_for_nothing(trainer: Trainer) -> None:
     assert trainer.state.optimizer.moments("means")[2] == 4 * CHECK_EVERY  # every step has updated
 
 
-DENSE = {"densify": {"start": 60, "interval": 40, "grad_threshold": 5e-5, "reset_interval": 150}, "iterations": 7000}
-CHAIN = {"mcmc": {"enabled": True, "start": 60, "interval": 40, "cap": 700}, "iterations": 7000}
-FAST_PLAN = {**DENSE, "fast": {"densify": "budget", "opacity": "halve", "morton": True, "growth": 2.0}}
+PLAN = {"start": 60, "interval": 40, "grad_threshold": 5e-5, "reset_interval": 150}
+DENSE = {"density": {"settings": PLAN}, "iterations": 7000}
+CHAIN = {"density": {"name": "mcmc", "settings": {"start": 60, "interval": 40, "cap": 700}}, "iterations": 7000}
+BUDGET = {**PLAN, "opacity": "halve", "morton": True, "growth": 2.0}
+FAST_PLAN = {"density": {"name": "budget", "settings": BUDGET}, "iterations": 7000}
 
 
 @pytest.mark.parametrize(
     "values",
     [
         DENSE,
-        {**DENSE, "sparse_adam": "per_row"},
+        {**DENSE, "sparse_adam": True},
         CHAIN,
         FAST_PLAN,
-        {**FAST_PLAN, "fast": {**FAST_PLAN["fast"], "resolution": "dash"}},
+        {**FAST_PLAN, "pictures": {"schedule": "dash"}},
     ],
     ids=["dense", "sparse", "mcmc", "fast", "fast-dash"],
 )
@@ -150,8 +153,7 @@ def test_updates_in_the_backward_pass_are_those_of_the_optimizer(values, monkeyp
     monkeypatch.setattr(FusingOptimizer, "step", spy)
     for fuses in (False, True):
         with seeded(0, deterministic=True):
-            trainer = make_trainer(small_scene(3), config, deterministic=True)
-            trainer.state.stage.fuses_updates = fuses
+            trainer = make_trainer(small_scene(3), config, fuses=fuses, deterministic=True)
             trainer.run(50, lambda record: None)
         outcomes.append(trainer)
         assert sum(fused) == (49 if fuses else 0)  # the moments exist from the first update on
@@ -166,8 +168,8 @@ def test_updates_in_the_backward_pass_are_those_of_the_optimizer(values, monkeyp
 
 
 def test_mcmc_grows_to_its_cap_with_what_it_draws_on_the_cpu():
-    chain = MCMC(enabled=True, start=20, interval=20, cap=600)
-    trainer = make_trainer(small_scene(3), ThreeDGSConfig(iterations=200, mcmc=chain))
+    chain = {"name": "mcmc", "settings": {"start": 20, "interval": 20, "cap": 600}}
+    trainer = make_trainer(small_scene(3), ThreeDGSConfig.model_validate({"iterations": 200, "density": chain}))
     trainer.run(200, lambda record: None)
     assert trainer.state.model.num_rows == 600
     assert all(torch.isfinite(p).all() for p in trainer.state.model.parameters())

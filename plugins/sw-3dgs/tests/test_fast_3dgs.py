@@ -2,11 +2,8 @@
 
 import pytest
 import torch
-from sw_gaussians.averaging import AverageParameters
-from sw_gaussians.cadence import CadencedOptimizer
 from sw_gaussians.config import Fast, GaussianTraining
-from sw_gaussians.fast import FAST
-from sw_gaussians.fast_tasks import PruneByViews
+from sw_gaussians.density.budget import BudgetSettings
 from sw_gaussians.late_batches import SumViews
 from sw_gaussians.resolution import ResolutionSampler
 from sw_gaussians.stage import ThreeDGSStage
@@ -24,6 +21,7 @@ from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.pipeline import TrainingRun, TrainingStopped
 from splatwizard_core.training.scheduler import build_schedulers, format_plan
 from sw_3dgs.method import ThreeDGS
+from sw_3dgs.presets import FAST
 
 PLAN = """\
 Stage | Task                        | Plan
@@ -36,17 +34,21 @@ Post  | densify to budget           | range(270, 7200, 243)
 Post  | halve opacity               | range(0, 7200, 1800)"""
 STEPS = 60
 SHORT = {
-    "iterations": STEPS, "densify.interval": 5_000, "fast.sh_every": 3, "fast.resolution": "dash",
-    "fast.resolution_hold": True, "fast.cap": 1_500, "densify.reset_interval": 10_000,
-    "lr.sh_dc": 2e-2, "lr.opacity": 0.1, "fast.veto_views": 2, "fast.veto_pixels": 1,
-    "fast.score": "opacity_variance", "fast.settle": 0.5, "fast.average": 0.9,
+    "iterations": STEPS, "density.settings.interval": 5_000, "pictures.schedule": "dash", "lr.opacity": 0.1,
+    "density.settings.cap": 1_500, "density.settings.reset_interval": 10_000, "lr.sh_dc": 2e-2,
+    "density.settings.score": "opacity_variance", "fast.average": 0.9, "fast.late_views": 3,
 }  # fmt: skip
-"""Rounds 10 steps apart, the last one at step 42; halvings at 20 and 40; from step 48 on rates fall, and the mean is
-taken of samples at 50 and 60."""
+"""Rounds 10 steps apart, the last one at step 42; halvings at 20 and 40; from step 48 on three views make one update,
+and the mean is taken of samples at 50 and 60."""
 
 
 def stage_of(**sets) -> ThreeDGSStage:
-    return ThreeDGSStage(resolve(ThreeDGS, "fast", sets={k.replace("__", "."): v for k, v in sets.items()}).config)
+    return made_stage("fast", {k.replace("__", "."): v for k, v in sets.items()})
+
+
+def made_stage(preset: str, sets=None) -> ThreeDGSStage:
+    config = resolve(ThreeDGS, preset, sets=sets).config
+    return ThreeDGSStage(config, config.density.load(load_plugins()))
 
 
 @pytest.fixture(scope="module")
@@ -121,8 +123,8 @@ def test_learning_rates_do_not_follow_the_length_unless_asked():
 @pytest.mark.parametrize(
     ("sets", "gone", "come"),
     [
-        ({"fast__densify": "threshold"}, "densify to budget", "prune and densify"),
-        ({"fast__opacity": "reset"}, "halve opacity", "reset opacity"),
+        ({"density": "adc"}, "densify to budget", "prune and densify"),
+        ({"density__settings__opacity": "reset"}, "halve opacity", "reset opacity"),
         ({"fast__average": 0}, "average parameters", "densify to budget"),
     ],
 )
@@ -133,7 +135,7 @@ def test_each_task_can_be_left_out(sets, gone, come):
 
 
 def test_on_a_cpu_pictures_begin_small_and_opacities_are_left_alone(scene):
-    stage = ThreeDGSStage(resolve(ThreeDGS, "fast-cpu").config)
+    stage = made_stage("fast-cpu")
     _, post = build_schedulers(stage, PipelineParams())
     names = {entry.name for step in range(1, stage.iterations + 1) for entry in post.registrations if entry.due(step)}
     assert "densify to budget" in names
@@ -144,7 +146,7 @@ def test_on_a_cpu_pictures_begin_small_and_opacities_are_left_alone(scene):
 
 
 def test_opacity_gradients_are_rendered_until_the_last_densification_and_in_the_last_step():
-    stage, black = stage_of(fast__score="opacity_variance"), torch.zeros(3)
+    stage, black = stage_of(density__settings__score="opacity_variance"), torch.zeros(3)
     asked = [stage.raster_options(step, black).fragment_grad for step in (1, 7_199, 7_200, 8_999, 9_000)]
     assert asked == [True, True, False, False, True]
     assert not stage_of().raster_options(1, black).fragment_grad
@@ -153,28 +155,12 @@ def test_opacity_gradients_are_rendered_until_the_last_densification_and_in_the_
 
 
 def test_the_end_has_its_own_tasks_where_it_is_asked_for():
-    plan = format_plan(
-        *build_schedulers(
-            stage_of(iterations=10_000, fast__settle=0.1, fast__late_prune=True, fast__late_views=4), PipelineParams()
-        )
-    )
-    assert "| average parameters          | range(9400, 10001, 10)" in plan  # after the last pruning
+    plan = format_plan(*build_schedulers(stage_of(iterations=10_000, fast__late_views=4), PipelineParams()))
+    assert "| average parameters          | range(9000, 10001, 10)" in plan
     assert "| sum views                   | range(8000, 10001)" in plan
-    assert "| settle learning rates       | range(8000, 10001)" in plan
-    assert "| prune by views              | range(8400, 9600, 400)" in plan
 
 
-@pytest.mark.parametrize(
-    ("preset", "steps"),
-    [("paper", [18_000, 21_000, 24_000]), ("fast", [7_560, 7_920, 8_280]), ("quick", [1_360, 1_520, 1_680])],
-)
-def test_late_pruning_is_after_density_control_in_every_plan(preset, steps):
-    stage = ThreeDGSStage(resolve(ThreeDGS, preset, sets={"fast.late_prune": True}).config)
-    assert list(stage.late_prunes) == steps
-    assert stage.settled < steps[0] < steps[-1] < stage.iterations
-
-
-@pytest.mark.parametrize(("key", "value"), [("late_prune", True), ("late_views", 8), ("settle", 0.5), ("average", 0.1)])
+@pytest.mark.parametrize(("key", "value"), [("late_views", 8), ("average", 0.1)])
 def test_parts_of_an_end_that_does_not_come_are_refused(key, value):
     with pytest.raises(ConfigError, match=f"fast.{key} would have no effect"):
         stage_of(**{"fast__average": 0, f"fast__{key}": value}, scale_schedule=False, iterations=7_000)
@@ -185,42 +171,22 @@ def test_an_average_over_few_steps_has_two_samples():
     assert "range(9995, 10001, 5)" in {str(entry.when) for entry in pre.registrations}
 
 
-@pytest.mark.parametrize("steps", [30, 49, 300, 9_000])  # in the first two a prune comes at every step
-def test_no_average_crosses_a_late_pruning(steps):
-    stage = stage_of(iterations=steps, fast__late_prune=True)
-    pre, _ = build_schedulers(stage, PipelineParams())
-    (task,) = (entry.task for entry in pre.registrations if isinstance(entry.task, AverageParameters))
-    assert stage.late_prunes[-1] < task.first < task.last == steps
-
-
 @pytest.mark.parametrize("steps", [1, 2, 7])
 def test_a_plan_scaled_to_a_few_steps_has_no_end_and_is_not_refused(steps):
-    pre, _ = build_schedulers(stage_of(iterations=steps, fast__settle=0.5, fast__late_views=4), PipelineParams())
-    (task,) = (entry.task for entry in pre.registrations if isinstance(entry.task, SumViews))
+    _, post = build_schedulers(stage_of(iterations=steps, fast__late_views=4), PipelineParams())
+    (task,) = (entry.task for entry in post.registrations if isinstance(entry.task, SumViews))
     assert task.last == steps - 1
 
 
 def test_late_sums_end_with_the_last_update():
-    pre, _ = build_schedulers(stage_of(fast__late_views=4), PipelineParams())
-    (task,) = (entry.task for entry in pre.registrations if isinstance(entry.task, SumViews))
+    _, post = build_schedulers(stage_of(fast__late_views=4), PipelineParams())
+    (task,) = (entry.task for entry in post.registrations if isinstance(entry.task, SumViews))
     assert task.last == 8_999  # no update follows the last step
 
 
-def test_late_pruning_goes_by_the_loss_of_the_training():
-    _, post = build_schedulers(
-        stage_of(fast__late_prune=True, loss__lambda_dssim=0.5, loss__ssim_padding="valid"), PipelineParams()
-    )
-    (task,) = (entry.task for entry in post.registrations if isinstance(entry.task, PruneByViews))
-    assert (task.lambda_dssim, task.padding) == (0.5, "valid")
-
-
 def test_parts_are_off_unless_asked_for(scene):
-    stage, model = ThreeDGSStage(GaussianTraining()), gaussians_from_points(scene.points)
-    assert not isinstance(stage.create_optimizer(model, scene), CadencedOptimizer)
-    assert not isinstance(stage.create_sampler(scene, stream(0, "sampler")), ResolutionSampler)
-    on = stage_of(fast__sh_every=16, fast__resolution="dash")
-    assert isinstance(on.create_optimizer(model, scene), CadencedOptimizer)
-    assert isinstance(on.create_sampler(scene, stream(0, "sampler")), ResolutionSampler)
+    assert not isinstance(ThreeDGSStage(GaussianTraining()).create_sampler(scene, stream(0, "s")), ResolutionSampler)
+    assert isinstance(stage_of(pictures__schedule="dash").create_sampler(scene, stream(0, "s")), ResolutionSampler)
 
 
 def test_updates_in_the_backward_pass_can_be_asked_for():
@@ -231,34 +197,17 @@ def test_updates_in_the_backward_pass_can_be_asked_for():
     assert ThreeDGS(load_plugins(), usual).stages()[0].fuses_updates is None
 
 
-@pytest.mark.parametrize(
-    "sets",
-    [
-        {"mcmc__enabled": True},
-        {"densify__absgrad": True, "fast__score": "opacity_variance"},
-        {"sparse_adam": "none"},
-        {"mcmc__enabled": True, "fast__densify": "threshold"},
-        {"mcmc__enabled": True, "fast__densify": "threshold", "fast__opacity": "reset"},
-        {"fast__densify": "threshold", "fast__veto_views": 10},
-        {"fast__late_views": 4, "sparse_adam": "per_row"},
-        {"fast__late_views": 4, "fast__sh_every": 2},
-        {
-            "mcmc__enabled": True,
-            "fast__densify": "threshold",
-            "fast__opacity": "reset",
-            "fast__morton": False,
-            "fast__late_prune": True,
-        },
-    ],
-)
-def test_what_does_not_go_together_is_said_before_anything_runs(sets):
-    with pytest.raises(ConfigError, match="fast"):
-        stage_of(**sets)
+@pytest.mark.parametrize("sets", [{"density": "mcmc"}, {"fast__late_views": 4}])
+def test_what_needs_updates_of_all_gaussians_is_refused_beside_sparse_ones(sets):
+    with pytest.raises(ConfigError, match="sparse_adam=true leaves Gaussians"):
+        stage_of(sparse_adam=True, fast__average=0.0, **sets)
 
 
 def test_every_part_is_a_key_of_its_own():
     names = {key.partition(".")[2] for key in FAST if key.startswith("fast.")}
     assert names <= set(Fast.model_fields)
+    settings = {f"density.settings.{name}" for name in BudgetSettings.model_fields}
+    assert {key for key in FAST if key.startswith("density.")} <= settings
 
 
 @pytest.mark.pipeline

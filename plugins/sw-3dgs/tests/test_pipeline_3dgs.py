@@ -24,10 +24,10 @@ PLAN = {
     "iterations": STEPS,
     "lr.max_steps": STEPS,
     "sh_interval": 60,
-    "densify.start": 50,
-    "densify.stop": 200,
-    "densify.interval": 25,
-    "densify.reset_interval": 120,
+    "density.settings.start": 50,
+    "density.settings.stop": 200,
+    "density.settings.interval": 25,
+    "density.settings.reset_interval": 120,
 }
 
 
@@ -43,7 +43,8 @@ def rasterizer() -> NegotiatedRasterizer:
 
 def method(**values) -> ThreeDGS:
     values = {key.replace("__", "."): value for key, value in values.items()}
-    return ThreeDGS(load_plugins(), apply_overrides(ThreeDGSConfig(), {**PLAN, **values}, source="test"))
+    plan = PLAN if "density" not in values else {"iterations": STEPS}
+    return ThreeDGS(load_plugins(), apply_overrides(ThreeDGSConfig(), {**plan, **values}, source="test"))
 
 
 def train(scene, rasterizer, directory=None, stop_after=None, **values):
@@ -97,15 +98,15 @@ def test_training_starts_again_from_a_decoded_file(scene, rasterizer, trained, t
     from sw_gaussians.ply import export_ply
 
     export_ply(trained.model, tmp_path / "model.ply")
-    resumed = train(
-        scene, rasterizer, init=str(tmp_path / "model.ply"), iterations=20, densify__stop=0, lr__position_init=1.6e-5
-    )
+    values = {"iterations": 20, "density__settings__stop": 0, "lr__position_init": 1.6e-5}
+    resumed = train(scene, rasterizer, init=str(tmp_path / "model.ply"), **values)
     assert resumed.model.active_sh_degree == 3
     assert psnr(resumed.model, scene, rasterizer) > psnr(trained.model, scene, rasterizer) - 0.5
 
 
 def test_absgrad_trains(scene, rasterizer):
-    outcome = train(scene, rasterizer, iterations=60, densify__absgrad=True, densify__grad_threshold=8e-4)
+    settings = {"density__settings__absgrad": True, "density__settings__grad_threshold": 8e-4}
+    outcome = train(scene, rasterizer, iterations=60, **settings)
     assert len(outcome.losses) == 60
     assert torch.isfinite(outcome.model.means).all()
 
@@ -116,9 +117,8 @@ def dense(scene, rasterizer):
     return train(scene, rasterizer, iterations=80)
 
 
-@pytest.mark.parametrize("correction", ["none", "per_row"])
-def test_sparse_adam_trains_and_resumes(scene, rasterizer, dense, tmp_path, correction):
-    values = {"iterations": 80, "sparse_adam": correction}
+def test_sparse_adam_trains_and_resumes(scene, rasterizer, dense, tmp_path):
+    values = {"iterations": 80, "sparse_adam": True}
     whole = train(scene, rasterizer, **values)
     start = method().create_model(scene, stream(0, "init"))
     assert psnr(whole.model, scene, rasterizer) > psnr(start, scene, rasterizer) + 2
@@ -130,4 +130,4 @@ def test_sparse_adam_trains_and_resumes(scene, rasterizer, dense, tmp_path, corr
 
 def test_sparse_adam_and_the_regularisers_of_mcmc_exclude_each_other():
     with pytest.raises(ConfigError, match="set one of the two"):
-        method(sparse_adam="none", mcmc__enabled=True).stages()
+        method(sparse_adam=True, density="mcmc").stages()

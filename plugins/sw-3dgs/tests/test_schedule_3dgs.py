@@ -4,10 +4,11 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from sw_gaussians.learning_rate import UpdateLearningRate
 from sw_gaussians.ply import export_ply
 from sw_gaussians.stage import ThreeDGSStage
 from sw_gaussians.start import gaussians_from_points
-from sw_gaussians.tasks import PruneAndDensify, ResetOpacity, UpdateLearningRate
+from sw_gaussians.tasks import PruneAndDensify, ResetOpacity
 
 from splatwizard_core.errors import SceneError, UserInputError
 from splatwizard_core.gaussians.model import GaussianModel
@@ -38,7 +39,7 @@ def stage_of(preset: str = "paper", **values) -> ThreeDGSStage:
     config = apply_overrides(ThreeDGSConfig(), {k.replace("__", "."): v for k, v in values.items()}, source="test")
     if preset != "paper":
         config = resolve(ThreeDGS, preset, sets={k.replace("__", "."): v for k, v in values.items()}).config
-    return ThreeDGSStage(config)
+    return ThreeDGSStage(config, config.density.load(load_plugins()))
 
 
 def plan_of(stage: ThreeDGSStage) -> dict[str, str]:
@@ -77,8 +78,8 @@ def test_presets_set_what_the_table_of_differences_says():
     assert recent.ppl.clamp_render
     assert resolve(ThreeDGS, "inria").config.lr.opacity == 0.05
     assert not resolve(ThreeDGS, "inria").ppl.clamp_render
-    absgrad = resolve(ThreeDGS, "absgrad").config.densify
-    assert (absgrad.absgrad, absgrad.grad_threshold) == (True, 8e-4)
+    absgrad = resolve(ThreeDGS, "absgrad").config.density.settings
+    assert (absgrad["absgrad"], absgrad["grad_threshold"]) == (True, 8e-4)
 
 
 @pytest.mark.parametrize("name", [*ThreeDGS.PRESETS])
@@ -89,7 +90,7 @@ def test_every_preset_resolves_at_every_rate_point(name, rate):
 
 def test_no_reset_comes_after_the_end_of_densification_on_white_either():
     for stop, resets in ((15_000, True), (400, False)):
-        stage = stage_of(densify__stop=stop)
+        stage = stage_of(density__settings__stop=stop)
         begin(stage, tiny_scene("white"))
         assert ("reset opacity (white background)" in plan_of(stage)) == resets
 
@@ -110,7 +111,9 @@ def test_a_scaled_schedule_scales_bounds_intervals_and_the_rules_inside_tasks():
     pre, post = build_schedulers(stage, PipelineParams())
     tasks = {r.name: r.task for r in (*pre.registrations, *post.registrations)}
     assert tasks["update lr"].max_steps == 3000
-    assert tasks["prune and densify"].settings["size_rules_after"] == 300
+    assert (
+        stage.control.steps(stage.control.settings.reset_interval) == 300
+    )  # until then nothing is pruned for its size
 
 
 def test_a_white_scene_gets_one_more_reset_between_densification_and_the_periodic_one():
@@ -168,19 +171,6 @@ def test_groups_and_their_rates():
     assert rates["means"] == pytest.approx(1.6e-4 * scene.extent)
     assert [rates[n] for n in list(rates)[1:]] == [2.5e-3, 1.25e-4, 0.05, 5e-3, 1e-3]
     assert all((g.eps, g.betas) == (1e-15, (0.9, 0.999)) for g in optimizer.groups.values())
-
-
-def test_a_pause_after_a_reset_skips_densification():
-    scene = tiny_scene()
-    model = begin(stage_of(), scene)
-    with torch.no_grad():
-        model.log_scales.fill_(-4.0)  # none is so large that the size rule prunes it
-    optimizer = ThreeDGSStage(ThreeDGSConfig()).create_optimizer(model, scene)
-    task = PruneAndDensify(pause_after_reset=200)
-    for step, ran in ((100, True), (2900, True), (3000, False), (3100, False), (3200, True), (6100, False)):
-        model.denom.fill_(1.0)
-        task(model, optimizer, scene, ThreeDGSConfig(), step, TaskLog())
-        assert (not model.denom.any()) is ran, step
 
 
 def test_the_last_step_neither_densifies_nor_resets():

@@ -159,6 +159,42 @@ def test_mask_pictures_are_found(colmap_folder, load, pattern):
     assert scene.train[1].mask is None
 
 
+@pytest.mark.parametrize("pattern", ["{}.jpg", "{}_mask.png", "mask_{}.png", "{}.mask.png", "{}.png"])
+@pytest.mark.parametrize("folders", [True, False])
+def test_masks_are_found_by_other_names_and_those_of_no_image_told(colmap_folder, load, pattern, folders):
+    if folders:
+        colmap_folder.names = [f"left/{name}" for name in colmap_folder.names]
+    root = colmap_folder.write()
+    (root / "masks").mkdir()
+    for name in ("000", "001", "another"):
+        Image.new("L", (32, 24), 255).save(root / "masks" / pattern.format(name))
+    told = load(root).warnings
+    found = pattern != "{}.mask.png"
+    assert any("the masks of 2 pictures are not used" in line for line in told) == found
+    assert any(f"{1 if found else 3} of 3 pictures in masks are the mask of no image" in line for line in told)
+
+
+@pytest.mark.parametrize("sparse", ["colmap_text", "."])
+def test_a_model_is_found_beside_the_pictures(colmap_folder, load, sparse):
+    colmap_folder.sparse = sparse
+    scene = load(colmap_folder.write())
+    assert (len(scene.train), len(scene.test)) == (8, 2)
+    assert scene.protocol.id.startswith("colmap/images/")
+
+
+def test_files_that_macos_writes_beside_pictures_are_none(colmap_folder, load):
+    root = colmap_folder.write()
+    (root / "images" / "._000.png").write_bytes(b"\0\5\x16\7")
+    assert not any("have no pose" in line for line in load(root).warnings)
+
+
+def test_a_picture_folder_of_another_name_is_named(colmap_folder, load):
+    colmap_folder.pictures = "input"
+    with pytest.raises(SceneError, match=r"picture folder 'images' is missing; there is input \(--images input\)"):
+        load(colmap_folder.write())
+    assert load(colmap_folder.root, images="input").protocol.id.startswith("colmap/input/")
+
+
 DISTORTED = [name for name, _ in MODELS.values() if name not in ("SIMPLE_PINHOLE", "PINHOLE", "EQUIRECTANGULAR")]
 
 

@@ -67,6 +67,8 @@ ANGLE_X, ANGLE_Y = 2 * math.atan(W / 2 / FX), 2 * math.atan(H / 2 / 20.0)
         ({"fl_x": FX}, (FX, FX), (16, 12)),
         ({"fl_x": FX, "fl_y": 20.0, "cx": 15.0, "cy": 13.0}, (FX, 20.0), (15, 13)),
         ({"fl_x": 2 * FX, "fl_y": 40.0, "cx": 30.0, "cy": 26.0, "w": 2 * W, "h": 2 * H}, (FX, 20.0), (15, 13)),
+        ({"fl_x": 2 * FX, "cx": 30.0, "cy": 26.0, "w": 2 * W}, (FX, FX), (15, 13)),
+        ({"fl_x": 2 * FX, "h": 2 * H}, (FX, FX), (16, 12)),
         ({"camera_angle_x": ANGLE_X}, (FX, FX), (16, 12)),
         ({"camera_angle_x": ANGLE_X, "camera_angle_y": ANGLE_Y}, (FX, 20.0), (16, 12)),
         ({"camera_angle_y": ANGLE_Y}, (20.0, 20.0), (16, 12)),
@@ -190,3 +192,55 @@ def test_blender_cameras_that_do_not_see_the_cube_get_points_where_they_look(sca
     scene = load(root, split="every8", init_points=100)
     assert any("do not look at the cube" in line for line in scene.warnings)
     assert scene.points.xyz[:, 2].min() > 30
+
+
+def test_intrinsics_of_a_picture_of_another_size_are_told(scan, load):
+    about = "more than a quarter of the picture off its centre"
+    assert any(about in line for line in load(scan({"fl_x": 2 * FX, "cx": float(W), "cy": float(H)})).warnings)
+    sized = load(scan({"fl_x": 2 * FX, "cx": float(W), "cy": float(H), "w": 2 * W, "h": 2 * H}))
+    assert not any(about in line for line in sized.warnings)
+
+
+@pytest.mark.parametrize(
+    ("keys", "change", "words"),
+    [
+        ({"fl_x": 0.0, "w": W, "h": H}, None, "the focal lengths of image 'images/0.png' are 0 and 0 px"),
+        (None, lambda m: m.T, "the last row of 'transform_matrix' of image 'images/0.png' is .*: is it transposed"),
+        (None, lambda m: m @ np.diag([1, 1, -1, 1]), "is not a rotation and a translation"),
+        (None, lambda m: m * [[2.5, 2.5, 2.5, 1]], "is not a rotation and a translation"),
+        (None, lambda m: m + 1e30 * np.eye(4, k=3), "the pose of image 'images/0.png' makes no sense"),
+    ],
+)
+def test_cameras_that_make_no_sense_are_one_clear_line(scan, load, keys, change, words):
+    root = scan(keys)
+    if change is not None:
+        data = json.loads((root / "transforms.json").read_text())
+        for frame in data["frames"]:
+            frame["transform_matrix"] = change(np.array(frame["transform_matrix"])).tolist()
+        (root / "transforms.json").write_text(json.dumps(data))
+    with pytest.raises(SceneError, match=words) as caught:
+        load(root)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("change", [lambda m: m @ np.diag([1, -1, -1, 1]), np.linalg.inv], ids=["OpenCV axes", "back"])
+def test_cameras_that_see_no_start_point_are_told(scan, load, change):
+    root = scan()
+    rows = "".join(f"{x:.3f} {y:.3f} {z:.3f}\n" for x, y, z in np.random.default_rng(0).normal(0, 0.2, (200, 3)))
+    head = (
+        "ply\nformat ascii 1.0\nelement vertex 200\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+    )
+    (root / "points3d.ply").write_text(head + rows)
+    assert not any("see none of the start points" in line for line in load(root).warnings)
+    data = json.loads((root / "transforms.json").read_text())
+    for frame in data["frames"]:
+        frame["transform_matrix"] = change(np.array(frame["transform_matrix"])).tolist()
+    (root / "transforms.json").write_text(json.dumps(data))
+    assert any("9 of 9 cameras see none of the start points: poses or" in line for line in load(root).warnings)
+
+
+def test_masks_of_instant_ngp_are_told(scan, load):
+    root = scan()
+    for i in range(3):
+        Image.new("L", (W, H)).save(root / "images" / f"dynamic_mask_{i}.png")
+    assert "3 masks dynamic_mask_*.png (instant-ngp) are not used" in load(root).warnings

@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import pytest
 import torch
 from sw_gaussians.config import GaussianTraining
-from sw_gaussians.fused_adam import OFFERED, FusingOptimizer
+from sw_gaussians.control_tasks import Collect
+from sw_gaussians.fast.fused_adam import OFFERED, FusingOptimizer
 from sw_gaussians.stage import ThreeDGSStage
 from sw_gaussians.start import gaussians_from_points
-from sw_gaussians.statistics import collect_statistics
 
 from splatwizard_core.api import ConfigError
 from splatwizard_core.scene.scene import PointCloud
@@ -79,7 +79,7 @@ def test_what_a_backward_pass_has_done_is_counted_and_the_rest_is_done(taken):
 
 def test_it_is_offered_where_no_task_but_the_statistics_follows(monkeypatch):
     config = GaussianTraining.model_validate(
-        {"iterations": 40, "densify": {"start": 10, "stop": 30, "interval": 5, "reset_interval": 12}}
+        {"iterations": 40, "density": {"settings": {"start": 10, "stop": 30, "interval": 5, "reset_interval": 12}}}
     )
     stage = ThreeDGSStage(config)
     _, post = build_schedulers(stage, PipelineParams())
@@ -94,14 +94,14 @@ def test_it_is_offered_where_no_task_but_the_statistics_follows(monkeypatch):
     for step in range(1, 41):
         stage.raster_options(step, background)
     assert offered == []  # or there are many Gaussians
-    monkeypatch.setattr("sw_gaussians.stage.FUSED_FROM", stage._optimizer.model.num_rows)
+    monkeypatch.setattr("sw_gaussians.fast.fused_adam.FUSED_FROM", stage._optimizer.model.num_rows)
     stage.raster_options(step := 2, background)
     assert offered == [2]
     offered.clear()
     stage.fuses_updates = True
     for step in range(1, 41):
         stage.raster_options(step, background)
-    others = {step for entry in post.registrations if entry.task is not collect_statistics
+    others = {step for entry in post.registrations if not isinstance(entry.task, Collect)
               for step in range(1, 41) if entry.due(step)}  # fmt: skip
     assert len(others) > 4
     assert offered == [step for step in range(1, 40) if step not in others]
@@ -123,10 +123,9 @@ def test_a_stage_made_of_this_one_offers_nothing(monkeypatch):
     stage.raster_options(3, torch.zeros(3))
 
 
-@pytest.mark.parametrize("values", [{"sparse_adam": "per_row"}, {"fast": {"sh_every": 2}}])
-def test_it_is_refused_beside_other_optimizers(values):
+def test_it_is_refused_beside_the_sparse_optimizer():
     with pytest.raises(ConfigError, match="fused_updates"):
-        ThreeDGSStage(GaussianTraining.model_validate(values), fuses_updates=True)
+        ThreeDGSStage(GaussianTraining(sparse_adam=True), fuses_updates=True)
 
 
 def test_it_is_refused_on_a_cpu_if_it_is_asked_for():
@@ -136,5 +135,4 @@ def test_it_is_refused_on_a_cpu_if_it_is_asked_for():
     with pytest.raises(ConfigError, match="CUDA"):
         ThreeDGSStage(GaussianTraining(), fuses_updates=True).begin(context)
     assert ThreeDGSStage(GaussianTraining(), fuses_updates=None).begin(context) is model
-    for values in ({"sparse_adam": "per_row"}, {"fast": {"sh_every": 2}}):
-        assert ThreeDGSStage(GaussianTraining.model_validate(values), fuses_updates=None).fuses_updates is None
+    assert ThreeDGSStage(GaussianTraining(sparse_adam=True), fuses_updates=None).fuses_updates is None

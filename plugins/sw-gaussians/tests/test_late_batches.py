@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from sw_gaussians.late_batches import BatchingOptimizer, SumViews
+from sw_gaussians.late_batches import SumViews
 
 from splatwizard_core.api import GaussianModel, ParamGroup, SplatOptimizer, stream
 
@@ -17,11 +17,11 @@ def groups() -> list[ParamGroup]:
     return [ParamGroup(name, lr=0.01) for name in GaussianModel.RAW]
 
 
-def run(optimizer: BatchingOptimizer, task: SumViews, steps: range) -> None:
+def run(optimizer: SplatOptimizer, task: SumViews, steps: range) -> None:
     for step in steps:
-        task(optimizer, step)
         for name, p in optimizer.model.named_parameters():
             p.grad = torch.randn(p.shape, generator=stream(step, name))
+        task(optimizer.model, optimizer, step)
         optimizer.step()
         optimizer.zero_grad()
 
@@ -39,7 +39,7 @@ def plain(sums: list[range]) -> dict[str, torch.Tensor]:
 
 def test_it_updates_at_each_step_until_the_first_and_then_with_sums():
     model = model_of()
-    optimizer = BatchingOptimizer(model, groups())
+    optimizer = SplatOptimizer(model, groups())
     run(optimizer, SumViews(views=3, first=4), range(1, 11))
     expected = plain([range(1, 2), range(2, 3), range(3, 4), range(4, 7), range(7, 10)])  # the gradient of 10 waits
     for name, p in model.named_parameters():
@@ -49,7 +49,7 @@ def test_it_updates_at_each_step_until_the_first_and_then_with_sums():
 
 def test_the_last_step_updates_with_what_there_is():
     model = model_of()
-    run(BatchingOptimizer(model, groups()), SumViews(views=8, first=2, last=4), range(1, 5))
+    run(SplatOptimizer(model, groups()), SumViews(views=8, first=2, last=4), range(1, 5))
     expected = plain([range(1, 2), range(2, 5)])
     for name, p in model.named_parameters():
         assert torch.allclose(p, expected[name], rtol=1e-6, atol=1e-7), name
@@ -60,11 +60,11 @@ def test_sums_follow_the_rows_and_are_saved():
     ends = []
     for resumes in (False, True):
         model = model_of()
-        optimizer = BatchingOptimizer(model, groups())
+        optimizer = SplatOptimizer(model, groups())
         run(optimizer, task, range(1, 4))
         optimizer.keep_rows(model, order)
         if resumes:
-            saved, optimizer = optimizer.state_dict(), BatchingOptimizer(model, groups())
+            saved, optimizer = optimizer.state_dict(), SplatOptimizer(model, groups())
             optimizer.load_state_dict(saved)
         run(optimizer, task, range(4, 5))
         ends.append(model.means.detach())

@@ -5,7 +5,7 @@ from math import comb
 
 import pytest
 import torch
-from sw_gaussians.mcmc import add_noise, draw, grow, relocate, shared_among
+from sw_gaussians.density.mcmc import add_noise, draw, grow, relocate, shared_among
 from sw_gaussians.start import gaussians_from_points
 
 from splatwizard_core.errors import ShapeError

@@ -30,13 +30,18 @@ Pre   | increase SH degree | range(0, 30000, 1000)
 Post  | relocate           | range(600, 25000, 100)
 Post  | grow               | range(600, 25000, 100)"""
 SHORT = {
-    "iterations": 200, "lr.max_steps": 200, "sh_interval": 60, "mcmc.start": 40, "mcmc.stop": 180, "mcmc.interval": 20,
-    "mcmc.cap": 700,
+    "iterations": 200, "lr.max_steps": 200, "sh_interval": 60, "density.settings.start": 40,
+    "density.settings.stop": 180, "density.settings.interval": 20, "density.settings.cap": 700,
 }  # fmt: skip
 
 
 def method(**sets) -> ThreeDGS:
     return ThreeDGS(load_plugins(), resolve(ThreeDGS, "mcmc", sets={**SHORT, **sets}).config)
+
+
+def stage_of(**sets) -> ThreeDGSStage:
+    config = resolve(ThreeDGS, "mcmc", sets=sets).config
+    return ThreeDGSStage(config, config.density.load(load_plugins()))
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +59,7 @@ def whole(scene):
 
 
 def test_the_plan_is_the_published_one():
-    stage = ThreeDGSStage(resolve(ThreeDGS, "mcmc").config)
+    stage = stage_of()
     assert format_plan(*build_schedulers(stage, PipelineParams())) == PLAN
 
 
@@ -68,9 +73,9 @@ def test_the_plan_is_the_published_one():
     ],
 )
 def test_noise_is_added_until_the_last_step_whatever_the_rates_do(sets, steps):
-    stage = ThreeDGSStage(resolve(ThreeDGS, "mcmc", sets=sets).config)
+    stage = stage_of(**sets)
     pre, _ = build_schedulers(stage, PipelineParams())
-    (entry,) = (entry for entry in pre.registrations if isinstance(entry.task, AddNoise))
+    (entry,) = (entry for entry in pre.registrations if entry.name == "add noise")
     assert entry.when == range(steps)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from sw_gaussians.config import GaussianTraining
-from sw_gaussians.fast_tasks import DensifyToBudget
+from sw_gaussians.density.budget import BudgetControl
 from sw_gaussians.resolution import (
     ResolutionPlan,
     ResolutionSampler,
@@ -19,9 +19,8 @@ from sw_gaussians.resolution import (
     shrunk,
 )
 from sw_gaussians.stage import ThreeDGSStage
-from sw_gaussians.tasks import UpdateLearningRate
 
-from splatwizard_core.api import Camera, CameraSampler, ConfigError, PipelineParams, View, stream
+from splatwizard_core.api import Camera, CameraSampler, PipelineParams, View, stream
 from splatwizard_core.training.scheduler import build_schedulers
 
 SIDE = 256
@@ -107,29 +106,6 @@ def test_the_scale_changes_only_where_statistics_start_again():
     assert scales[::10] == sorted(set(scales), reverse=True)
 
 
-def test_the_position_rate_is_held_until_the_last_level_of_half_size():
-    config = GaussianTraining.model_validate({
-        "iterations": 3_000, "scale_schedule": True, "fast": {"resolution": "dash", "resolution_hold": True},
-    })  # fmt: skip
-    stage, scene = ThreeDGSStage(config), SimpleNamespace(train=views(), background=None)
-    pre, _ = build_schedulers(stage, PipelineParams())
-    update = next(entry.task for entry in pre.registrations if isinstance(entry.task, UpdateLearningRate))
-    drawn = stage.create_sampler(scene, stream(0, "sampler"))
-    drawn._plan = ResolutionPlan((0, 400, 600, 1500), (4.0, 2.5, 1.9, 1.0))
-    assert [update.rate(step, 2.0) for step in (1, 400)] == pytest.approx([3.2e-4] * 2)
-    assert update.rate(1_700, 2.0) == pytest.approx(3.2e-5)  # half of what is left
-    assert update.rate(3_000, 2.0) == pytest.approx(3.2e-6)
-    assert ResolutionPlan((0, 100), (1.8, 1.0)).coarse_until == ResolutionPlan((0,), (1.0,)).coarse_until == 0
-
-
-def test_holding_the_rate_is_off_unless_asked_for_and_needs_a_resolution_schedule():
-    dash = GaussianTraining.model_validate({"fast": {"resolution": "dash"}})
-    pre, _ = build_schedulers(ThreeDGSStage(dash), PipelineParams())
-    assert pre.registrations[0].task.rate(15_000, 1.0) == pytest.approx(1.6e-5)
-    with pytest.raises(ConfigError, match=r"set fast\.resolution=dash"):
-        ThreeDGSStage(GaussianTraining.model_validate({"fast": {"resolution_hold": True}}))
-
-
 def test_pictures_without_detail_are_whole_from_the_start():
     flat = spectrum(torch.full((1, 8, 8), 0.5))
     for image in (flat, spectrum(torch.zeros(1, 8, 8))):
@@ -139,15 +115,14 @@ def test_pictures_without_detail_are_whole_from_the_start():
 @pytest.mark.parametrize("iterations", [500, 900, 4_500, 6_100, 10_000])
 def test_statistics_of_every_round_of_the_preset_fast_are_of_one_resolution(iterations):
     config = GaussianTraining.model_validate({
-        "iterations": iterations, "scale_schedule": True, "densify": {"start": 900, "stop": 24_000, "interval": 750},
-        "fast": {"densify": "budget", "resolution": "dash"},
+        "iterations": iterations, "scale_schedule": True, "pictures": {"schedule": "dash"},
     })  # fmt: skip
-    stage = ThreeDGSStage(config)
+    stage = ThreeDGSStage(config, BudgetControl(start=900, stop=24_000, interval=750))
     _, post = build_schedulers(stage, PipelineParams())
-    (entry,) = (entry for entry in post.registrations if isinstance(entry.task, DensifyToBudget))
+    (entry,) = (entry for entry in post.registrations if entry.name == "densify to budget")
     last = round(0.8 * iterations)
     rounds = [step for step in range(1, last + 1) if entry.due(step)]
-    assert (entry.task.first, entry.task.last) == (rounds[0], rounds[-1])
+    assert list(stage.densifications) == rounds
     pictures = views()
     scene = SimpleNamespace(train=pictures, background=None)
     drawn = stage.create_sampler(scene, stream(0, "sampler"))

@@ -103,7 +103,7 @@ def densified(min_opacity: float = 0.05) -> tuple[SurfelModel, SurfelModel]:
     model.grad_accum[:2], model.denom[:2] = 1e-3, 1
     optimizer = SplatOptimizer(model, [ParamGroup(name, lr=0.0) for name in PARAMETERS])
     report = densify_and_prune(model, optimizer, step=600, extent=EXTENT, min_opacity=min_opacity)
-    assert (report.cloned, report.split) == (1, 1)
+    assert (report["cloned"], report["split"]) == (1, 1)
     return before, model
 
 

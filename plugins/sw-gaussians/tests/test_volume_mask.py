@@ -98,7 +98,7 @@ def test_clones_and_children_copy_the_mask():
     optimizer = SplatOptimizer(model, [ParamGroup(name, lr=0.0) for name in NAMES])
     model.grad_accum[:2], model.denom[:] = 3e-4, 1
     report = densify_and_prune(model, optimizer, step=600, extent=10.0)
-    assert (report.cloned, report.split, report.total) == (1, 1, 6)
+    assert (report["cloned"], report["split"], model.num_rows) == (1, 1, 6)
     assert model.mask_logits.tolist() == [2.0, 1.0, 1.0, 2.0, 3.0, 3.0]
 
 

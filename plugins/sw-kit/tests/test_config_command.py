@@ -30,7 +30,7 @@ def test_every_key_is_taken_with_the_value_that_is_told(method, rate):
 def test_every_key_has_a_meaning_and_numbers_have_bounds():
     rows = {each["key"]: each for _, part in blocks("3dgs", "inria", "r2") for each in part}
     assert [key for key, each in rows.items() if not each["meaning"] and not key.startswith("metrics.")] == []
-    assert rows["densify.start"]["value"] == "600"
+    assert rows["density.settings.start"]["value"] == "600"
     assert rows["codec.settings.position_bits"] == {
         "key": "codec.settings.position_bits", "value": "14", "type": "int", "bounds": ">= 8, <= 21",
         "meaning": "bits per axis of the position grid",
@@ -51,7 +51,7 @@ def test_types_and_bounds_are_spelled_for_people():
 
 
 def test_the_command_prints_a_table_or_json():
-    done = CliRunner().invoke(config, ["3dgs", "--only", "densify.absgrad"])
+    done = CliRunner().invoke(config, ["3dgs", "--only", "density.settings.absgrad"])
     assert done.exit_code == 0
     assert "sum absolute pixel gradients" in done.output
     done = CliRunner().invoke(config, ["3dgs", "--only", "seed", "--json"])

@@ -12,7 +12,6 @@ from splatwizard_core.api import Camera, GaussianInputs, RasterOptions, ScoreSpe
 from splatwizard_native import MemoryMeter
 from sw_rasterizers.inference import FlashRasterizer
 from sw_rasterizers.native import MODULE, unavailable_on_cuda
-from sw_rasterizers.scoring import PupRasterizer
 from sw_rasterizers.standard import StandardRasterizer
 from sw_rasterizers.surfel import SurfelRasterizer
 
@@ -45,7 +44,7 @@ class Way:
 
 STANDARD, TRAINING = Way(StandardRasterizer), Way(StandardRasterizer, training=True)
 SURFELS, FLASH = Way(SurfelRasterizer), Way(FlashRasterizer)
-COUNTED = Way(PupRasterizer, scores=True)
+COUNTED = Way(StandardRasterizer, scores=True)
 WAYS = [
     *(pytest.param(way, "cpu", id=f"cpu-{name}") for name, way in (
         ("standard", STANDARD), ("training", TRAINING), ("surfels", SURFELS), ("scores", COUNTED))),

@@ -258,14 +258,12 @@ def test_what_is_not_offered_is_refused():
     rasterizer, (g, cam) = StandardRasterizer(), draw_scene(replace(MANY, n=5), 1, torch.float32)
     for options, missing in (
         (RasterOptions(normals=True), "NORMALS"),
-        (RasterOptions(fisher=True), "FISHER"),
         (RasterOptions(dtype_out="uint8"), "UINT8_OUT"),
-        (RasterOptions(scores=(ScoreSpec("s", "hits"),)), "SCORE_HITS"),
     ):
         with pytest.raises(CapabilityError, match=missing):
             rasterizer.render(g, cam, options)
-    with pytest.raises(CapabilityError, match="SCORE_HITS"):
-        rasterizer.accumulate(g, [cam], RasterOptions(scores=(ScoreSpec("s", "hits"),)))
+    with pytest.raises(CapabilityError, match="NORMALS"):
+        rasterizer.accumulate(g, [cam], RasterOptions(scores=(ScoreSpec("s", "hits"),), normals=True))
     with pytest.raises(ConfigError, match="gsplat"):
         rasterizer.render(g, cam, RasterOptions(profile="gsplat"))
     with pytest.raises(ShapeError, match="background"):

@@ -1,4 +1,4 @@
-"""The named variants of the standard kernels: accel, depth, c3dgs."""
+"""The standard kernels under other names, and with codebooks: c3dgs."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from splatwizard_core.api import SH, CapabilityError, Feature, RasterOptions, Sh
 from splatwizard_core.tooling import NegotiatedRasterizer, load_plugins
 from sw_rasterizers.native import MODULE, unavailable_on_cuda
 from sw_rasterizers.segments import Tables
-from sw_rasterizers.variants import AccelRasterizer, DepthRasterizer, IndexedRasterizer
+from sw_rasterizers.standard import StandardRasterizer
+from sw_rasterizers.variants import IndexedRasterizer
 
 needs_kernels = pytest.mark.skipif(MODULE.available() is not None, reason=str(MODULE.available()))
-VARIANTS = [AccelRasterizer, DepthRasterizer, IndexedRasterizer]
 DEVICES = [
     pytest.param("cpu", marks=needs_kernels),
     pytest.param(
@@ -33,24 +33,20 @@ DEVICES = [
 BOOKS = RasterCase("books", n=300, width=40, height=30, color="indexed", geometry="indexed", degree=2, active_degree=2)
 
 
-def pairs(of):
-    return [
-        pytest.param(c, x, id=f"{c.info.name}-{x.name if hasattr(x, 'name') else x}") for c in VARIANTS for x in of(c)
-    ]
-
-
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize(("variant", "check"), pairs(lambda c: checks_for(c.info)))
-def test_facts_of_every_rasterizer(variant, check, device):
-    if device == "cuda" and check not in checks_for(variant.info.on("cuda")):
+@pytest.mark.parametrize("check", checks_for(IndexedRasterizer.info), ids=str)
+def test_facts_of_every_rasterizer(check, device):
+    if device == "cuda" and check not in checks_for(IndexedRasterizer.info.on("cuda")):
         pytest.skip("not on CUDA")
-    check(variant(), device)
+    check(IndexedRasterizer(), device)
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize(("variant", "case"), pairs(lambda c: [k for k in GRADIENT_CASES if applies(k, c.info)]))
-def test_values_and_gradients_are_those_of_the_reference(variant, case, device):
-    check_against(variant(), ReferenceRasterizer(), case, 1, device)
+@pytest.mark.parametrize(
+    "case", [k for k in GRADIENT_CASES if applies(k, IndexedRasterizer.info)], ids=lambda k: k.name
+)
+def test_values_and_gradients_are_those_of_the_reference(case, device):
+    check_against(IndexedRasterizer(), ReferenceRasterizer(), case, 1, device)
 
 
 @needs_kernels
@@ -219,16 +215,16 @@ def test_the_inputs_come_back_as_they_were():
 @needs_kernels
 def test_what_a_variant_does_not_declare_is_refused():
     g, cam = draw_scene(RasterCase(), 1, torch.float32)
-    with pytest.raises(CapabilityError, match=r"'accel' does not offer DEPTH_MEDIAN"):
-        AccelRasterizer().render(g, cam, RasterOptions(depth=frozenset({"median"})))
+    with pytest.raises(CapabilityError, match=r"'c3dgs' does not offer FISHER"):
+        IndexedRasterizer().render(g, cam, RasterOptions(fisher=True))
 
 
 @needs_kernels
 @pytest.mark.parametrize(
     ("prefer", "case", "options", "served"),
     [
-        (["accel"], {"color": "split"}, RasterOptions(), "accel"),
-        (["depth"], {}, RasterOptions(depth=frozenset({"inverse", "median"}), antialias=True), "depth"),
+        (["accel"], {"color": "split"}, RasterOptions(), "standard"),
+        (["depth", "c3dgs"], {}, RasterOptions(depth=frozenset({"inverse", "median"}), antialias=True), "standard"),
         ([], {"color": "indexed", "geometry": "indexed"}, RasterOptions(), "c3dgs"),
         ([], {"color": "indexed", "geometry": "indexed"}, RasterOptions(clamp_color=False), "c3dgs"),
         (["c3dgs"], {"geometry": "cov3d", "color": "colors"}, RasterOptions(), "c3dgs"),
@@ -241,3 +237,19 @@ def test_they_are_found_by_name_and_codebooks_by_what_is_asked(prefer, case, opt
     asked = Feature.asked_by(options, g).names
     assert chosen.select(asked).info.name == served
     assert asked <= chosen.select(asked).info.features
+
+
+def test_the_twelve_names_of_papers_are_listed_and_accepted(monkeypatch):
+    aliases = {"accel", "depth", "count", "speedy", "pup", "mesongs", "trimgs"}
+    names = {"standard", "c3dgs", "2dgs", "flash", "tcgs", *aliases}
+    rasterizers = load_plugins().rasterizers
+    assert names <= set(rasterizers.names)
+    assert not aliases & {entry.name for entry in rasterizers}
+    for name in aliases:
+        assert rasterizers.entry(name).name == "standard"
+        assert rasterizers.load(name) is StandardRasterizer
+        monkeypatch.setenv("SW_RASTERIZER", name)
+        assert NegotiatedRasterizer(load_plugins(), device="cpu").select(["BACKWARD"]).info.name == "standard"
+    monkeypatch.delenv("SW_RASTERIZER")
+    left = NegotiatedRasterizer(load_plugins(), device="cpu", forbid=["accel", "c3dgs"])
+    assert left.select(["BACKWARD"]).info.name == "reference"

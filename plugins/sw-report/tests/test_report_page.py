@@ -11,6 +11,8 @@ from sw_report import pictures
 from sw_report.page import PageOptions, render_page, write_page
 from sw_report.runs import collect
 
+from splatwizard_core.tooling import as_installed
+
 VOID = {"meta", "img", "input", "br", "hr", "link"}
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(1)>\"'&{{ 7*7 }}"
 
@@ -179,6 +181,21 @@ def test_names_from_strangers_stay_text(make_run, make_curve, tmp_path):
         assert not any(name.startswith("on") for _, attributes in found.elements for name in attributes)
         assert all(image["src"].startswith("data:") for image in found.all("img"))
         assert HOSTILE in found.text
+
+
+@pytest.mark.usefixtures("advice_as_installed")
+def test_advice_on_the_page_is_that_of_the_terminal(make_run):
+    """None of our packages is on an index: what is shown names the checkout, or the wheels, that this came from."""
+    advice = "weights-missing: pip install 'sw-metrics[lpips]'"
+
+    def without_weights(content):
+        content["metrics"]["lpips_vgg"] = {"mean": None, "per_view": [], "direction": "lower"}
+        content["unknown"]["metrics.lpips_vgg.mean"] = advice
+
+    found = page(make_run(change=without_weights))
+    assert as_installed(advice) != advice
+    assert as_installed(advice) in found.text
+    assert advice not in found.text
 
 
 def test_a_run_without_its_files_says_what_is_missing(make_run):

@@ -82,7 +82,7 @@ def test_children_of_the_ordinary_split_stay_in_the_plane(make):
     model.denom += 1
     optimizer = SplatOptimizer(model, [ParamGroup(name, 1e-3) for name, _ in model.named_parameters()])
     report = densify_and_prune(model, optimizer, step=1, extent=1e-3, min_opacity=0.0)
-    assert report.split == 1
+    assert report["split"] == 1
     assert float(((model.means.detach() - parent) @ normal).abs().max()) < 1e-6
 
 

@@ -22,7 +22,7 @@ from headless_chromium import WEBGL, Chromium, find_chromium
 from PIL import Image
 from sw_view.entries import Opened, find_entries, open_entry
 from sw_view.exhibits import exhibit
-from sw_view.page_file import About, write_page
+from sw_view.page_file import About, write_page, write_pair
 from sw_view.shown_cameras import surroundings_of
 
 from splatwizard_core.api import Camera, GaussianModel, RasterOptions, Scene, SceneOptions
@@ -162,6 +162,39 @@ def test_controls_move_the_eye_and_cameras_bring_it_back(browser, scene, model, 
     browser.key("h", 72)
     assert "A note." in browser.ask("document.getElementById('help').innerText")
     assert not [line for line in browser.complaints() if "ReadPixels" not in line]
+
+
+def test_both_halves_of_a_page_of_two_are_drawn_and_move_together(browser, scene, model, tmp_path):
+    """By what the window shows, against the page of each model alone in a window of its half."""
+    grey = GaussianModel(model.means, torch.ones_like(model.sh_dc), torch.zeros_like(model.sh_rest),
+                         model.opacity_logits, model.log_scales, model.quats).requires_grad_(False)  # fmt: skip
+    pages, around = [tmp_path / name for name in ("a.html", "b.html", "both.html")], surroundings_of(scene)
+    titled = [(model, About("a")), (grey, About("b"))]
+    for (each, about), page in zip(titled, pages, strict=False):
+        write_page(each, page, about, around)
+    write_pair(titled, pages[2], around)
+
+    def shown(page: Path, width: int, camera: int | None = None) -> np.ndarray:
+        browser.open(page, width=width, height=700)
+        documents = "[document, ...[...document.querySelectorAll('iframe')].map(f => f.contentDocument)]"
+        documents = f"{documents}.filter(d => d.getElementById('canvas'))"
+        settled = f"{documents}.every(d => d.documentElement.dataset.state === 'drawn')"
+        wait_for(browser, settled)
+        if camera is not None:  # in the first alone
+            choose = f"l => {{ l.value = {camera}; l.dispatchEvent(new Event('change')); }}"
+            browser.ask(f"({choose})({documents}[0].getElementById('camera'))")
+        time.sleep(0.5)  # the last frame, drawn at full size, reaches the window
+        wait_for(browser, settled)
+        browser.picture(tmp_path / "window.png", whole=False)
+        picture = np.asarray(Image.open(tmp_path / "window.png").convert("RGB"), np.float64) / 255
+        return picture[100:600]  # between the bars
+
+    for camera in (None, 1):
+        both = shown(pages[2], 1280, camera)
+        for alone, half in zip(pages, (both[:, :639], both[:, 641:]), strict=False):
+            assert half.std() > 0.05
+            assert psnr(half, shown(alone, 639, camera)) > 40
+    assert psnr(both[:, :639], both[:, 641:]) < 25  # two models, not one twice
 
 
 def test_an_eye_that_sees_nothing_is_shown_the_background(browser, scene, model, tmp_path):

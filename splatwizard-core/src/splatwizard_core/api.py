@@ -1,4 +1,4 @@
-"""The face of the core for methods, rasterizers, codecs, metrics and data sets: at most 80 names, stable since 0.2.
+"""The face of the core for methods, rasterizers, codecs, metrics and data sets: at most 83 names, stable since 0.2.
 
 docs/plugins.md describes each. Everything else in `splatwizard_core` may change with any release.
 """
@@ -29,6 +29,7 @@ MODULES = {
     "rendering.info": "RasterizerInfo",
     "training.stage": "Stage StageContext CameraSampler CameraIterator",
     "training.scheduler": "Scheduler",
+    "training.state": "TrainingState",
     "training.task_log": "TaskLog",
     "training.plan": "When",
     "training.overrides": "apply_overrides",
@@ -37,6 +38,7 @@ MODULES = {
     "training.optimizer": "SplatOptimizer ParamGroup",
     "training.losses": "LossPack photometric_loss",
     "training.pruner": "Pruner",
+    "training.density": "DensityControl",
     "streams": "stream",
     "coding.container": "ContainerReader ContainerWriter",
     "coding.limits": "beyond_limit",

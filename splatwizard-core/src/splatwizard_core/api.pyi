@@ -57,6 +57,7 @@ from splatwizard_core.scene.scene import Protocol as Protocol
 from splatwizard_core.scene.scene import Scene as Scene
 from splatwizard_core.scene.scene import View as View
 from splatwizard_core.streams import stream as stream
+from splatwizard_core.training.density import DensityControl as DensityControl
 from splatwizard_core.training.identity import given_values as given_values
 from splatwizard_core.training.losses import LossPack as LossPack
 from splatwizard_core.training.losses import photometric_loss as photometric_loss
@@ -75,6 +76,7 @@ from splatwizard_core.training.stage import CameraIterator as CameraIterator
 from splatwizard_core.training.stage import CameraSampler as CameraSampler
 from splatwizard_core.training.stage import Stage as Stage
 from splatwizard_core.training.stage import StageContext as StageContext
+from splatwizard_core.training.state import TrainingState as TrainingState
 from splatwizard_core.training.task_log import TaskLog as TaskLog
 from splatwizard_native.errors import ForeseenError as ForeseenError
 from splatwizard_native.files import replacing as replacing

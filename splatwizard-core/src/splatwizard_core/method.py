@@ -100,5 +100,6 @@ def create_method(
         raise ConfigError(f"'{name}' has no preset '{preset}'; it has {', '.join(cls.PRESETS)}", key="preset")
     borrowed = {k: v for k, v in cls.PRESETS[preset].items() if not is_beside_method(cls.Config, k)}
     values = {**borrowed, **dotted(config or {}, "")}
-    asked = apply_overrides(cls.Config(), values, source=(source := f"config of '{name}'"))
+    usual, source = cls.Config(), f"config of '{name}'"
+    asked = apply_overrides(usual, values, source=source, known=usual.settings_keys(plugins))
     return cls(plugins, asked.completed(plugins, dict.fromkeys(values, source)))

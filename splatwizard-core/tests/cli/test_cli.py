@@ -397,8 +397,8 @@ def test_ctrl_c_leaves_a_training_that_resumes(tmp_path: Path):
     ("arguments", "told"),
     [
         (["run", "--iterations", "300"], "--set iterations=300"),
-        (["run", "--method", "3dgs", "--grad-threshold=4e-4"], "--set densify.grad_threshold=4e-4"),
-        (["train", "--densify.grad_threshold", "4e-4"], "--set densify.grad_threshold=4e-4"),
+        (["run", "--method", "3dgs", "--grad-threshold=4e-4"], "--set density.settings.grad_threshold=4e-4"),
+        (["train", "--density.settings.grad_threshold", "4e-4"], "--set density.settings.grad_threshold=4e-4"),
         (["eval", "scene.ply", "--test-every", "4"], "--set test_every=4"),
         (["schedule", "3dgs", "--iterations"], "--set iterations=VALUE"),
         (["run", "--log-every", "5"], "--set log_every=5"),

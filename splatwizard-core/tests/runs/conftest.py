@@ -147,7 +147,9 @@ import torch
 import toy_method
 from splatwizard_core.method import create_method
 from splatwizard_core.plugins import hookimpl
+from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.training.optimizer import SplatOptimizer
+from splatwizard_core.training.task_log import TaskLog
 
 
 @hookimpl
@@ -164,6 +166,12 @@ def register_pruners(registry):
 def register_coders(registry):
     registry.add("toy-coder", "toy_helper:ToyPruner", summary="for tests")
     registry.add("fixed-coder", "toy_helper:ToyPruner", summary="imported, not asked for")
+
+
+@hookimpl
+def register_tasks(registry):
+    registry.add("dim", "toy_helper:Dim", summary="for tests", factory=True)
+    registry.add("look", "toy_helper:look", summary="for tests", factory=False)
 
 
 NOTES = []
@@ -197,6 +205,26 @@ class ToyPruner:
 
 def look(optimizer: SplatOptimizer) -> None:
     pass
+
+
+class Dim:
+    """A task that makes everything fainter, and counts how often it has."""
+
+    def __init__(self, *, by: float = 0.5, floor: float = -4.0):
+        if by < 0:
+            raise ValueError(f"by is {by}: it must be at least 0")
+        self.by, self.floor, self.calls = by, floor, 0
+
+    def __call__(self, model: GaussianModel, log: TaskLog) -> None:
+        self.calls += 1
+        model.opacity_logits.sub_(self.by).clamp_(min=self.floor)
+        log.scalar("dimmed", self.calls)
+
+    def state_dict(self):
+        return {"calls": self.calls}
+
+    def load_state_dict(self, state):
+        self.calls = state["calls"]
 
 
 class Second(toy_method.ToyStage):

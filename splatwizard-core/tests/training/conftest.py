@@ -9,6 +9,7 @@ import torch
 from sw_anchors.phase_switch import PhaseSwitch
 from sw_gaussians import density
 from sw_gaussians.learning_rate import exponential_lr
+from sw_gaussians.stage import increase_sh_degree
 from sw_gaussians.start import gaussians_from_points
 from sw_gaussians.statistics import accumulate_statistics
 
@@ -123,7 +124,7 @@ def reset(model: GaussianModel, optimizer: SplatOptimizer) -> None:
 
 
 def increase_degree(model: GaussianModel) -> None:
-    density.increase_sh_degree(model)
+    increase_sh_degree(model)
 
 
 class ToyStage(Stage):

@@ -1,8 +1,9 @@
 """Hyper-parameters of 2DGS, by default those of the authors' code; what it chooses by data set is unset here."""
 
 from pydantic import Field
-from sw_gaussians.choices import Choosing, CodecChoice
-from sw_gaussians.config import Densify, GaussianTraining
+from sw_gaussians.choices import CodecChoice
+from sw_gaussians.config import GaussianTraining
+from sw_gaussians.density.choice import DensityChoice
 from sw_gaussians.start import Rotation
 from sw_gaussians.surface_losses import NormalTerm
 
@@ -31,7 +32,7 @@ class SurfaceTraining(Params):
     normal_after: int = Field(7_000, ge=0, description="last step without the normal loss")
 
 
-class TwoDGSConfig(Choosing, GaussianTraining):
+class TwoDGSConfig(GaussianTraining):
     """Everything that can be set for 2DGS."""
 
     sh_degree: int = Field(3, ge=0, le=3, description="highest degree of the spherical harmonics")
@@ -41,10 +42,10 @@ class TwoDGSConfig(Choosing, GaussianTraining):
     init_rotation: Rotation = Field(
         "uniform4", description="first rotations: four numbers in 0..1 as published, haar (uniform) or identity"
     )
-    densify: Densify = Field(
+    density: DensityChoice = Field(
         # Paper: pruned every 3,000 steps; the authors' code: at each densification. We follow the code.
-        Densify(start=600, min_opacity=0.05),
-        description="adaptive density control",
+        DensityChoice(settings={"start": 600, "min_opacity": 0.05}),
+        description="density control",
     )
     surface: SurfaceTraining = Field(SurfaceTraining(), description="losses of the surface")
     codec: CodecChoice = Field(CodecChoice(name="gaussians-exact"), description="what writes the file")

@@ -48,8 +48,9 @@ class TwoDGS(GaussianMethod):
             return model
         points = start_points(scene, "2DGS", instead="--set init=FILE.ply")
         return surfels_from_points(
-            points, generator=generator, max_sh_degree=config.sh_degree, rotation=config.init_rotation
-        )
+            points, generator=generator, max_sh_degree=config.sh_degree, rotation=config.init_rotation,
+            **config.density.load(self.plugins).start_values(),
+        )  # fmt: skip
 
     def stages(self) -> Sequence[Stage]:
-        return [TwoDGSStage(self.config)]
+        return [TwoDGSStage(self.config, self.config.density.load(self.plugins))]

@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from sw_gaussians.stage import ThreeDGSStage
-from sw_gaussians.start import logit
 from sw_gaussians.surface_losses import add_surface_losses, maps_for
 from sw_gaussians.surfels import Surface, SurfelModel
 
@@ -17,7 +16,7 @@ from sw_2dgs.datasets import OTHER, surface_of
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from splatwizard_core.api import LossPack, RenderResult, SplatModel, StageContext, View
+    from splatwizard_core.api import DensityControl, LossPack, RenderResult, SplatModel, StageContext, View
     from sw_2dgs.config import TwoDGSConfig
 
 log = logging.getLogger(__name__)
@@ -31,24 +30,8 @@ class TwoDGSStage(ThreeDGSStage):
 
     name = "2dgs"
 
-    def __init__(self, opt: TwoDGSConfig) -> None:
-        super().__init__(opt)
-        if opt.mcmc.enabled:
-            raise ConfigError(
-                "mcmc.enabled relocates Gaussians with three scales, which surfels do not have: leave it off",
-                key="mcmc.enabled",
-            )
-        if opt.fast.densify == "budget" and opt.fast.score == "opacity_variance":
-            raise ConfigError(
-                "fast.score=opacity_variance sums opacity gradients over fragments, which no rasterizer of surfels "
-                "does: set fast.score=gradient",
-                key="fast.score",
-            )
-        for key, on in (("fast.veto_views", opt.fast.veto_views), ("fast.late_prune", opt.fast.late_prune)):
-            if on:
-                raise ConfigError(
-                    f"{key} counts the pixels of Gaussians, which no rasterizer of surfels does: leave it off", key=key
-                )
+    def __init__(self, opt: TwoDGSConfig, control: DensityControl | None = None) -> None:
+        super().__init__(opt, control)
         self.settings = opt.surface
         self.surface = self._configured(OTHER)
         self._drawn: dict[tuple[bool, bool], RasterOptions] = {}  # by the losses that are on
@@ -69,19 +52,6 @@ class TwoDGSStage(ThreeDGSStage):
         self._drawn.clear()
         log.info("surface of %s (%s): %s", scene.name, scene.protocol.dataset, self.surface)
         return model
-
-    def min_opacity(self) -> float:
-        """Return the threshold of pruning, one that surfels can reach again after an opacity reset.
-
-        Adam needs 33 steps from an opacity of 0.01 to 0.05, and the published plan leaves 100. In one that is scaled
-        down to fewer the threshold is below the reset: else nothing would survive it.
-        """
-        plan, least = self.config.densify, super().min_opacity()
-        has_resets = plan.reset_interval < plan.stop or (self.white and 0 < plan.white_reset < plan.stop)
-        way = logit(plan.min_opacity) - logit(plan.reset_opacity) if plan.min_opacity > 0 else 0.0
-        if has_resets and self.steps(plan.interval) * self.config.lr.opacity < way:
-            return min(least, plan.reset_opacity / 2)
-        return least
 
     def weights(self, step: int) -> tuple[float, float]:
         """Return the weights of distortion and normals at a step; 0 until their steps have come."""

@@ -4,8 +4,9 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 from pydantic import Field
-from sw_gaussians.choices import Choosing, CodecChoice, Moved
-from sw_gaussians.config import FUSED_FROM, GaussianTraining
+from sw_gaussians.choices import CodecChoice, Moved
+from sw_gaussians.config import GaussianTraining
+from sw_gaussians.fast.fused_adam import FUSED_FROM
 
 from splatwizard_core.api import InputFile
 from sw_codecs.models.settings import QuantizedSettings
@@ -14,7 +15,7 @@ MODES = {"exact": "gaussians-exact", "quantized": "gaussians-quantized"}
 """Word in the header of a file, and of `codec.mode` in configs of 0.1 -> codec."""
 
 
-class ThreeDGSConfig(Choosing, GaussianTraining):
+class ThreeDGSConfig(GaussianTraining):
     """Everything that can be set for 3DGS."""
 
     OLDER: ClassVar[Mapping[str, Moved]] = {
@@ -38,4 +39,4 @@ class ThreeDGSConfig(Choosing, GaussianTraining):
         if "codec.mode" in values:
             mode = values.pop("codec.mode")
             values["codec.name"] = MODES.get(mode, f"gaussians-{mode}")
-        return values
+        return super().translated(values)

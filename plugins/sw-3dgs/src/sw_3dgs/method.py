@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from sw_gaussians.method import HEADER_KEY, GaussianMethod
-from sw_gaussians.ply import load_ply
 from sw_gaussians.stage import ThreeDGSStage
 from sw_gaussians.start import gaussians_from_points, start_points
 from sw_gaussians.surfels import refuse_surfels
@@ -40,15 +40,16 @@ class ThreeDGS(GaussianMethod):
         """Gaussians of the .ply that `init` names, else one for each start point of the scene."""
         config: ThreeDGSConfig = self.config
         if config.init:
-            model = placed_in(load_ply(config.init), scene, str(config.init))
+            model = placed_in(self.plugins.read_gaussians(Path(config.init)), scene, str(config.init))
             refuse_surfels(model, f"init: {config.init}: method {self.name}")
             return model
         points = start_points(scene, "3DGS", instead="--set init=FILE.ply")
-        return gaussians_from_points(points, max_sh_degree=config.sh_degree, **config.mcmc.first_values())
+        start = config.density.load(self.plugins).start_values()
+        return gaussians_from_points(points, max_sh_degree=config.sh_degree, **start)
 
     def stages(self) -> Sequence[Stage]:
         config: ThreeDGSConfig = self.config
-        return [ThreeDGSStage(config, fuses_updates=config.fused_updates)]
+        return [ThreeDGSStage(config, config.density.load(self.plugins), fuses_updates=config.fused_updates)]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         """Write the model with the chosen codec, which the header calls `mode`, or `codec` if it is not one of two."""

@@ -1,11 +1,14 @@
 """Hyper-parameters of Compact3DGS. Defaults are those of the authors' code for real scenes."""
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
-from sw_gaussians.choices import Choosing, OwnCodec
-from sw_gaussians.config import Densify, GaussianTraining, Loss
+from sw_gaussians.choices import Choosing, Moved, OwnCodec
+from sw_gaussians.config import GaussianTraining, Loss
 from sw_gaussians.config import LearningRates as GaussianRates
+from sw_gaussians.density.choice import DensityChoice
+from sw_gaussians.older_keys import DENSIFY
 from sw_gaussians.pictures import Pictures
 
 from splatwizard_core.api import OptimizationParams, Params
@@ -90,8 +93,10 @@ class Codec(OwnCodec):
 class Compact3DGSConfig(Choosing, OptimizationParams):
     """Everything that can be set for Compact3DGS."""
 
+    OLDER: ClassVar[Mapping[str, Moved]] = DENSIFY
+
     lr: LearningRates = Field(LearningRates(), description="step sizes of the Gaussians")
-    densify: Densify = Field(Densify(), description="adaptive density control")
+    density: DensityChoice = Field(DensityChoice(), description="density control")
     loss: Loss = Field(Loss(), description="photometric loss")
     pictures: Pictures = Field(Pictures(), description="sizes of the training pictures")
     mask: Mask = Field(Mask(), description="the volume mask")
@@ -102,11 +107,12 @@ class Compact3DGSConfig(Choosing, OptimizationParams):
 
     @property
     def base(self) -> GaussianTraining:
-        """Hyper-parameters of the stage of 3DGS inside. What they add (SH, MCMC) has no effect or is off."""
+        """Hyper-parameters of the stage of 3DGS inside. What they add (SH) has no effect."""
         return GaussianTraining(
             iterations=self.iterations,
             scale_schedule=self.scale_schedule,
             lr=GaussianRates(**vars(self.lr)),
-            densify=self.densify,
+            density=self.density,
+            pictures=self.pictures,
             loss=self.loss,
         )

@@ -46,7 +46,8 @@ class Compact3DGS(Method):
                 path=scene.path,
             )
         c: Compact3DGSConfig = self.config
-        start = gaussians_from_points(scene.points, max_sh_degree=0)
+        values = c.density.load(self.plugins).start_values()
+        start = gaussians_from_points(scene.points, max_sh_degree=0, **values)
         try:
             color = ColorField(
                 levels=c.grid.levels, features=c.grid.features, coarsest=c.grid.coarsest, growth=c.grid.growth,
@@ -67,7 +68,7 @@ class Compact3DGS(Method):
             raise ConfigError(
                 f"no entropy coder is called '{coder}'; installed: {', '.join(known)}", key="codec.settings.coder"
             )
-        return [Compact3DGSStage(self.config)]
+        return [Compact3DGSStage(self.config, self.config.density.load(self.plugins))]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         if not isinstance(model, CompactGaussians):

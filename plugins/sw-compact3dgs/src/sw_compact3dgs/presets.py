@@ -21,7 +21,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     # The authors' values for real scenes (Mip-NeRF 360, Tanks and Temples, Deep Blending), plan of Splatwizard's paper.
     "paper": {},
     # Their strict comparison makes 600 the first densification.
-    "inria": {"densify.start": 600},
+    "inria": {"density.settings.start": 600},
     # The authors' values for Synthetic-NeRF and DTU; "paper" has them for scenes that are known to be of these.
     "synthetic": SYNTHETIC,
     # The plan scaled down for a CPU and the demo scene: a small grid, step sizes for few steps, codebooks of 4 stages.
@@ -32,9 +32,9 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "lr.position_final": 8e-6,
         "lr.scales": 1e-2,
         "lr.quats": 2e-3,
-        "densify.start": 200,
-        "densify.stop": 1000,
-        "densify.grad_threshold": 4e-4,
+        "density.settings.start": 200,
+        "density.settings.stop": 1000,
+        "density.settings.grad_threshold": 4e-4,
         "mask.lr": 0.08,
         "mask.interval": 100,
         "grid.levels": 8,

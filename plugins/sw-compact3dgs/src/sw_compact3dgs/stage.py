@@ -1,14 +1,13 @@
 """The training stage: that of 3DGS with a mask in its densification and its loss, and codebooks for its last steps."""
 
-from collections.abc import Callable
+from collections.abc import Mapping
 
-import torch
 from sw_gaussians.stage import ThreeDGSStage
 from sw_gaussians.volume_mask import VolumeMaskedGaussians, mask_prune, prune_by_mask
 from torch import Tensor
 
 from splatwizard_core.api import (
-    CameraSampler,
+    DensityControl,
     LossPack,
     OptimizationParams,
     ParamGroup,
@@ -18,7 +17,7 @@ from splatwizard_core.api import (
     Scheduler,
     SplatModel,
     SplatOptimizer,
-    TaskLog,
+    TrainingState,
     View,
 )
 from sw_compact3dgs.config import Compact3DGSConfig
@@ -30,46 +29,15 @@ WARM_UP = 0.01
 FULL_PLAN = 30_000
 
 
-class MaskedDensification:
-    """Clones, splits and prunes as `inner` does, and in the same step removes what the mask turned off."""
-
-    def __init__(self, inner: Callable[..., None]) -> None:
-        self.inner = inner
-
-    def __call__(
-        self,
-        model: VolumeMaskedGaussians,
-        optimizer: SplatOptimizer,
-        scene: Scene,
-        opt: OptimizationParams,
-        step: int,
-        log: TaskLog,
-    ) -> None:
-        self.inner(model, optimizer, scene, opt, step, log)
-        if step < opt.iterations:
-            log.scalar("masked", prune_by_mask(model, optimizer, step=step))
-
-
 class Compact3DGSStage(ThreeDGSStage):
     """Trains CompactGaussians."""
 
     name = "compact3dgs"
 
-    def __init__(self, opt: Compact3DGSConfig) -> None:
-        super().__init__(opt.base)
-        opt.pictures.check(opt)
+    def __init__(self, opt: Compact3DGSConfig, control: DensityControl | None = None) -> None:
+        super().__init__(opt.base, control)
         self.opt = opt
         self.own = opt
-
-    def create_sampler(self, scene: Scene, generator: torch.Generator) -> CameraSampler:
-        return self.own.pictures.sampler(
-            super().create_sampler(scene, generator),
-            scene,
-            self,
-            growth=self.densifications,
-            growth_stop=self.own.densify.stop,
-            every=self.own.densify.interval,
-        )
 
     def create_optimizer(self, model: SplatModel, scene: Scene) -> SplatOptimizer:
         lr, own = self.own.lr, self.own
@@ -110,12 +78,15 @@ class Compact3DGSStage(ThreeDGSStage):
         )
         scheduler.register_task(self.when(self.own.rvq.start), self.switch_to_rvq, name="switch to RVQ training")
 
-    def densification(self) -> Callable[..., None]:
-        return MaskedDensification(super().densification())
+    def adjust(self, state: TrainingState) -> Mapping[str, int]:
+        """Clone, split and prune, and in the same step remove what the mask turned off."""
+        report = super().adjust(state)
+        assert isinstance(state.model, VolumeMaskedGaussians)
+        return {**report, "masked": prune_by_mask(state.model, state.optimizer, step=state.step)}
 
     def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
         super().register_post_task(scheduler, ppl, opt)
-        removals = range(self.own.densify.stop, FULL_PLAN, self.own.mask.interval)
+        removals = range(self.control.until, FULL_PLAN, self.own.mask.interval)
         scheduler.register_task(self.when(removals), mask_prune, name="mask prune")
 
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:

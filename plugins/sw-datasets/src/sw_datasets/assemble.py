@@ -21,8 +21,10 @@ FAR_OUT = 100.0
 """Distance of the cameras from the origin, in sizes of the scene, from which they are moved: float32 coordinates there
 have steps of 1e-5 of the scene, a hundredth of a pixel of a picture of 1600."""
 SAMPLED_POINTS, SAMPLED_CAMERAS = 2000, 32
+MIN_POINTS = 100  # of fewer it says nothing that cameras do not see them
 NEAR = 0.02
 """Near plane of a small scene, in median depths of its points; 3DGS has 0.2 in scenes of depth 5 to 10."""
+FARTHEST_PLACE = 1e12  # scene units: squared distances beyond it come near to the end of float32
 FARTHEST = 1e6  # pixels: focal lengths and principal points beyond it overflow float32 when they are projected with
 
 
@@ -107,7 +109,14 @@ def assemble_scene(
         if bad:
             notes.append(f"dropped {bad} of {len(points)} points that are not finite")
         points = finite
-        near = near_plane([view.camera for view in views], points.xyz)
+        depths = depths_seen([view.camera for view in views], points.xyz)
+        blind = sum(not len(each) for each in depths)
+        if len(points) >= MIN_POINTS and 2 * blind > len(depths):
+            notes.append(
+                f"{blind} of {len(depths)} cameras see none of the start points: poses or points may have other axes "
+                "than this layout has (OpenCV or OpenGL, camera to world or back)"
+            )
+        near = near_plane(depths, views[0].camera.near)
         if near is not None:
             notes.append(
                 f"most points lie nearer to the cameras than {views[0].camera.near:g}, where nothing is drawn: the "
@@ -151,16 +160,21 @@ def local_origin(views: Sequence[View], points: PointCloud | None) -> tuple[floa
     return (x, y, z)
 
 
-def near_plane(cameras: Sequence[Camera], points: Tensor) -> float | None:
-    """A near plane for scenes so small that most of their points would not be drawn; None: the usual one serves."""
+def depths_seen(cameras: Sequence[Camera], points: Tensor) -> list[Tensor]:
+    """For each camera the depths of the points that lie in its picture; of many cameras and points a sample."""
     some = points[:: max(1, len(points) // SAMPLED_POINTS)].double()
     depths = []
     for c in cameras[:: max(1, len(cameras) // SAMPLED_CAMERAS)]:
         t = some @ c.R.double().T + c.tau.double()
         u, v = c.fx * t[:, 0] / t[:, 2] + c.cx, c.fy * t[:, 1] / t[:, 2] + c.cy
         depths.append(t[(t[:, 2] > 0) & (u >= 0) & (u < c.width) & (v >= 0) & (v < c.height), 2])
+    return depths
+
+
+def near_plane(depths: Sequence[Tensor], usual: float) -> float | None:
+    """A near plane for scenes so small that most of their points would not be drawn; None: the usual one serves."""
     seen = torch.cat(depths) if depths else torch.zeros(0)
-    if not len(seen) or (middle := seen.median().item()) > cameras[0].near:
+    if not len(seen) or (middle := seen.median().item()) > usual:
         return None
     return float(f"{NEAR * middle:.2g}")
 
@@ -190,6 +204,8 @@ def _camera_fault(view: View) -> str | None:
     camera = view.camera
     if not (torch.isfinite(camera.R).all() and torch.isfinite(camera.tau).all()):
         return f"the pose of image '{view.name}' is not finite (NaN or infinite)"
+    if max(camera.R.abs().max(), camera.tau.abs().max()) > FARTHEST_PLACE:
+        return f"the pose of image '{view.name}' makes no sense: it lies farther than {FARTHEST_PLACE:g} from 0"
     numbers = (camera.fx, camera.fy, camera.cx, camera.cy)
     if not all(abs(x) <= FARTHEST for x in numbers) or min(camera.fx, camera.fy) < 1 / FARTHEST:
         return f"the intrinsics of image '{view.name}' make no sense: fx, fy, cx, cy = {numbers}"

@@ -25,6 +25,8 @@ from sw_datasets.rules import Rules
 
 STRETCH = 0.01
 """Share by which the scales of a picture in x and y may differ, beyond rounding to whole pixels, and be but told."""
+FAR_OFF = 0.25
+"""Share of the picture's side by which a principal point off the centre is told whatever the rules say."""
 SIDEWAYS = range(5, 9)
 """EXIF orientations that swap width and height."""
 
@@ -60,7 +62,7 @@ class Gate:
         self.cut = Counter[str]()
         self.seen = Counter[str]()
         self._unlike: tuple[float, str] = (0.0, "")
-        self._odd_mask = ""
+        self._odd_mask = self._far_off = ""
 
     def admit(self, name: str, file: Path, camera_size: tuple[int, int] | None) -> Picture:
         """Hold a picture against the size (width, height) that its camera was made for; None: the scene does not say.
@@ -110,6 +112,8 @@ class Gate:
         size = fitted_size(picture.width, picture.height, rules.resolution)
         off = max(abs(camera.cx - camera.width / 2), abs(camera.cy - camera.height / 2))
         self.off_centre = max(self.off_centre, off)
+        if abs(camera.cx / camera.width - 0.5) > FAR_OFF or abs(camera.cy / camera.height - 0.5) > FAR_OFF:
+            self._far_off = self._far_off or name
         if rules.principal_point != "file":
             camera = _centred(camera)
         cut_by_alpha = picture.has_alpha and (self.always_cut or rules.cuts_alpha)
@@ -196,6 +200,11 @@ class Gate:
             )
         if count := seen["odd masks"]:
             found.append(f"{count} masks are left out: {self._odd_mask}")
+        if self._far_off:
+            found.append(
+                f"the principal point of '{self._far_off}' lies more than a quarter of the picture off its centre: cx "
+                "and cy may be those of a picture of another size (w and h say of which)"
+            )
         if self.off_centre > 1 and self.rules.principal_point != "file":
             found.append(
                 f"the principal point is up to {self.off_centre:.1f} px off the image centre and is taken as the "

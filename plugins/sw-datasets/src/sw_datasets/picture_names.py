@@ -41,7 +41,8 @@ def list_pictures(folder: Path) -> list[str]:
         entered.add(real)
         folders.sort()
         for file in files:
-            if os.path.splitext(file)[1].lower() in SUFFIXES:
+            # "._NAME" is what macOS writes beside NAME onto disks of others, and no picture.
+            if os.path.splitext(file)[1].lower() in SUFFIXES and not file.startswith("._"):
                 found.append((Path(root) / file).relative_to(folder).as_posix())
     return sorted(found)
 

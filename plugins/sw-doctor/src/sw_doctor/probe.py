@@ -238,7 +238,7 @@ def _check_rasterizer(entry: Entry, plugins: PluginManager) -> Check:
             what, mend = _with_command_apart(why)
             return Check("rasterizers", entry.name, "missing", one_line(what), mend)
         entry.load()()  # for its own error: the choice below would tell of all others
-        alone = [name for name in plugins.rasterizers.names if name != entry.name]
+        alone = [each.name for each in plugins.rasterizers if each is not entry]
         rasterizer = NegotiatedRasterizer(plugins, device=device, prefer=[entry.name], forbid=alone)
         _draw(rasterizer, device, backward="BACKWARD" in info.features, axes=2 if "SURFEL" in info.needs else 3)
     except (Exception, SystemExit) as error:

@@ -2,6 +2,8 @@
 
 from splatwizard_core.api import SplatModel, SplatOptimizer
 
+SAMPLE_EVERY = 10
+"""Steps between two samples, fewer if the share begins later: reading parameters takes a hundredth of a step."""
 AVERAGE = "average"
 """Key of a parameter's state: its mean so far, of the parameter's shape."""
 
@@ -44,3 +46,12 @@ class AverageParameters:
                 mean.lerp_(value, 1 / samples)
             if step == self.last:
                 value.copy_(state.tensors.pop(AVERAGE))
+
+
+def average_of_the_end(share: float, *, first: int, last: int) -> AverageParameters | None:
+    """Return the task that averages over the last share, 0..1, of `last` steps, but not before `first`; 0: None."""
+    begin = max(first, round(last * (1 - share)))
+    if begin >= last:
+        return None
+    every = min(SAMPLE_EVERY, last - begin)
+    return AverageParameters(first=begin + (last - begin) % every, last=last, every=every)

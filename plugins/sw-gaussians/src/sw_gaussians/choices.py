@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from splatwizard_core.api import GaussianCodec, PluginManager, Pruner
 
 ChoiceT = TypeVar("ChoiceT", bound="Choice")
-ChoosingT = TypeVar("ChoosingT", bound="Choosing")
+ExchangeableT = TypeVar("ExchangeableT", bound="Exchangeable")
 
 
 class Named(Params):
@@ -121,6 +121,12 @@ class Choice(Named):
             found[field] = {k: v for k, v in checked.items() if field == "settings" or k in getattr(self, field)}
         return found
 
+    def settings_keys(self, plugins: PluginManager, path: str) -> dict[str, str]:
+        """Map the dotted keys of the provider's settings to their descriptions; `path` is that of this block."""
+        model = self._model(plugins, path)
+        fields = {} if model is None else model.model_fields
+        return {f"{path}.settings.{name}": field.description or "" for name, field in fields.items()}
+
     def normal(self: ChoiceT, plugins: PluginManager) -> ChoiceT:
         """Return this with those settings alone that differ from the provider's defaults."""
         model = self._model(plugins, self.NAME)
@@ -166,17 +172,23 @@ class PrunerChoice(Choice):
 class Moved(NamedTuple):
     """New place of a key of an older release.
 
-    keys        one or several; a setting is dropped where another provider than `provider` is chosen
-    default     value that the older release had
-    provider    whose setting it is, for a key of settings
+    keys        one or several; none: it is gone
+    default     value that the older release had; a key that is gone is refused with another one, if this is not None
+    provider    whose setting it is, for a key of settings: it is dropped where another is chosen
     """
 
     keys: tuple[str, ...]
     default: Any = None
-    provider: str = ""
+    provider: str | tuple[str, ...] = ""
+
+    def checked(self, old: str, value: Any) -> Any:
+        """Return a value of the key `old`. Raises ConfigError if it is gone, and did something."""
+        if not self.keys and self.default is not None and str(value).lower() != str(self.default).lower():
+            raise ConfigError(f"'{old}' is gone since 0.3, with what {value} did: leave it out", key=old)
+        return value
 
 
-class Choosing(OptimizationParams):
+class Exchangeable(OptimizationParams):
     """Base of configs with exchangeable parts.
 
     OLDER       key of an older release -> where it stands now: config files, run directories and checkpoints with it
@@ -193,20 +205,22 @@ class Choosing(OptimizationParams):
         """
         named = dict(_blocks(self))
         found = dict(values)
-        for name in sorted({*named, *(old.partition(".")[0] for old in self.OLDER)}):
+        all_older = self._all_older()
+        for name in sorted({*named, *(old.partition(".")[0] for old in all_older)}):
             if isinstance(found.get(name), Mapping):
                 found |= {f"{name}.{key}": value for key, value in found.pop(name).items()}
         for path, block in named.items():
             if isinstance(found.get(path), str):
                 found[f"{path}.{block.NAME}"] = found.pop(path)
         found = self.translated(found)
-        older = {old: found.pop(old) for old in list(found) if old in self.OLDER}
-        for old in [old for old in older if not self.OLDER[old].provider]:
-            found |= dict.fromkeys(self.OLDER[old].keys, older.pop(old))
+        older = {old: all_older[old].checked(old, found.pop(old)) for old in list(found) if old in all_older}
+        for old in [old for old in older if not all_older[old].provider]:
+            found |= dict.fromkeys(all_older[old].keys, older.pop(old))
         chosen = {path: found.get(f"{path}.{block.NAME}", block.chosen) for path, block in named.items()}
         for old, value in older.items():
-            moved = self.OLDER[old]
-            found |= {key: value for key in moved.keys if chosen[key.partition(".")[0]] == moved.provider}
+            moved = all_older[old]
+            whose = (moved.provider,) if isinstance(moved.provider, str) else moved.provider
+            found |= {key: value for key in moved.keys if chosen[key.partition(".")[0]] in whose}
         anew: dict[str, Any] = {}
         for path, block in named.items():
             fields = [f"{path}.{each}" for each in ("settings", *block.PARTS)] if isinstance(block, Choice) else []
@@ -217,17 +231,31 @@ class Choosing(OptimizationParams):
                 anew |= {f"{path}.{block.NAME}": chosen[path], **{key: {} for key in fields}}
         return {**anew, **found}
 
+    @classmethod
+    def _all_older(cls) -> dict[str, Moved]:
+        """Return `OLDER` of this class and its bases."""
+        return {old: moved for base in reversed(cls.__mro__) for old, moved in vars(base).get("OLDER", {}).items()}
+
     def translated(self, values: dict[str, Any]) -> dict[str, Any]:
         """Return values by dotted key where more than a key has changed since an older release: a value, say."""
         return values
 
-    def completed(self: ChoosingT, plugins: PluginManager, sources: Mapping[str, str]) -> ChoosingT:
+    def settings_keys(self, plugins: PluginManager) -> dict[str, str]:
+        """Map dotted keys of settings of the providers that it names to their descriptions."""
+        blocks = ((path, block) for path, block in _blocks(self) if isinstance(block, Choice))
+        return {key: told for path, block in blocks for key, told in block.settings_keys(plugins, path).items()}
+
+    def completed(self: ExchangeableT, plugins: PluginManager, sources: Mapping[str, str]) -> ExchangeableT:
         """Return this with all settings of the providers that it names, checked. Raises ConfigError."""
         content = super().completed(plugins, sources).model_dump()
         for path, block in _blocks(self):
             if isinstance(block, Choice):
                 content[path] |= block.completed(plugins, path, sources)
         return type(self).model_validate(content)
+
+
+class Choosing(Exchangeable):
+    """Base of configs of a method: besides or in place of `GaussianTraining`."""
 
 
 def _blocks(config: BaseModel) -> Iterator[tuple[str, Named]]:

@@ -1,9 +1,9 @@
-"""The schedule tasks of fast training, for the stage of 3DGS and, by name, for other methods.
+"""The schedule tasks of fast training, by name, for stages that have a plan of their own.
 
 As those of `tasks`, they change nothing at the last step of a stage: no update follows that could repair it.
 """
 
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 
@@ -17,22 +17,19 @@ from splatwizard_core.api import (
     SplatOptimizer,
     TaskLog,
 )
-from sw_gaussians import budget
-from sw_gaussians.veto import ViewEvidence, draw_views, view_evidence
-
-Score = Literal["opacity_variance", "gradient"]
+from sw_gaussians.blame import blame_of_views, draw_views, guilt
+from sw_gaussians.density import budget
+from sw_gaussians.density.budget import Score
 
 
 class DensifyToBudget:
-    """Prunes and grows within a budget (sw_gaussians.budget.densify_to_budget).
+    """Prunes and grows within a budget (sw_gaussians.density.budget.densify_to_budget).
 
     first, last     steps between which the budget rises linearly, from the start points of the scene to `cap`
     interval        steps between two calls; a Gaussian without a fragment is pruned only if that is a whole round of
                     the training views, or nearly
-    veto_views      training views that are drawn for each round: only Gaussians in more than `veto_pixels` of their
-                    badly drawn pixels a view get a neighbour (FastGS, arXiv 2511.04283: 10 views, 5 pixels); 0: no veto
     The other settings are those of `densify_to_budget`. With the default score the model needs the buffer of
-    `fragments.add_buffer`. Raises ValueError for settings outside their range.
+    `density.fragments.add_buffer`. Raises ValueError for settings outside their range.
     Curves: "cloned", "split", "pruned", numbers of Gaussians.
     """
 
@@ -49,23 +46,15 @@ class DensifyToBudget:
         percent_dense: float = 0.01,
         min_opacity: float = 0.005,
         morton: bool = False,
-        veto_views: int = 0,
-        veto_pixels: float = 5,
     ) -> None:
         if score not in budget.SCORES:
             raise ValueError(f"score '{score}' is none of {', '.join(budget.SCORES)}")
-        for name, value, least in (
-            ("cap", cap, 1),
-            ("growth", growth, 0),
-            ("interval", interval, 1),
-            ("veto_views", veto_views, 0),
-        ):
+        for name, value, least in (("cap", cap, 1), ("growth", growth, 0), ("interval", interval, 1)):
             if value < least:
                 raise ValueError(f"{name} is {value}: it must be at least {least}")
         self.first, self.last, self.interval, self.cap = first, last, interval, cap
         self.growth, self.score, self.grad_threshold = growth, score, grad_threshold
         self.percent_dense, self.min_opacity, self.morton = percent_dense, min_opacity, morton
-        self.veto_views, self.veto_pixels = veto_views, veto_pixels
 
     def __call__(
         self,
@@ -75,27 +64,22 @@ class DensifyToBudget:
         opt: OptimizationParams,
         step: int,
         log: TaskLog,
-        rasterizer: Rasterizer,
-        ppl: PipelineParams,
     ) -> None:
         if step >= opt.iterations:
             return
-        wanted = None
-        if self.veto_views:
-            wanted = _evidence(model, scene, rasterizer, ppl, self.veto_views).wanted(self.veto_pixels)
         start = 0 if scene.points is None else len(scene.points)
         target = budget.linear_target(step, first=self.first, last=self.last, start=start, cap=self.cap)
         report = budget.densify_to_budget(
             model, optimizer, step=step, extent=scene.extent, target=target, growth=self.growth, score=self.score,
             grad_threshold=self.grad_threshold, percent_dense=self.percent_dense, min_opacity=self.min_opacity,
-            prune_unused=1.1 * self.interval >= len(scene.train), morton=self.morton, wanted=wanted,
+            prune_unused=1.1 * self.interval >= len(scene.train), morton=self.morton,
         )  # fmt: skip
-        for name in ("cloned", "split", "pruned"):
-            log.scalar(name, getattr(report, name))
+        for name, count in report.items():
+            log.scalar(name, count)
 
 
 class HalveOpacity:
-    """Halves every opacity, down to `floor`, and lets Adam start afresh (sw_gaussians.budget.halve_opacity)."""
+    """Halves every opacity, down to `floor`, and lets Adam start afresh (sw_gaussians.density.budget.halve_opacity)."""
 
     def __init__(self, *, floor: float = budget.OPACITY_FLOOR) -> None:
         self.floor = floor
@@ -110,7 +94,7 @@ class PruneByViews:
 
     views           training views that are drawn each time
     min_opacity     fainter Gaussians go
-    most            those whose share of the blame exceeds this go, 0..1 (`veto.ViewEvidence.guilt`)
+    most            those whose share of the blame exceeds this go, 0..1 (`blame.guilt`)
     lambda_dssim, padding   of the photometric loss that a view's pixels are weighted with
 
     Views are drawn as the training draws them, but on the scene's background even where that of a step is random.
@@ -146,19 +130,14 @@ class PruneByViews:
         if step >= opt.iterations:
             return
         with torch.no_grad():
-            loss = {"lambda_dssim": self.lambda_dssim, "padding": self.padding}
-            evidence = _evidence(model, scene, rasterizer, ppl, self.views, **loss)
-            stays = (model.opacities >= self.min_opacity) & (evidence.guilt() <= self.most)
+            views = draw_views(scene.train, self.views, model.next_split_generator())
+            blame = blame_of_views(
+                model, views, rasterizer, scene.background.to(model.device), clamp=ppl.clamp_render,
+                lambda_dssim=self.lambda_dssim, padding=self.padding,
+            )  # fmt: skip
+            stays = (model.opacities >= self.min_opacity) & (guilt(blame) <= self.most)
             left, before = int(stays.sum()), model.num_rows
             if left == 0:
                 raise EmptyModel(step)
             optimizer.keep_rows(model, stays)
         log.scalar("pruned", before - left)
-
-
-def _evidence(
-    model: GaussianModel, scene: Scene, rasterizer: Rasterizer, ppl: PipelineParams, count: int, **loss: Any
-) -> ViewEvidence:
-    views = draw_views(scene.train, count, model.next_split_generator())
-    background = scene.background.to(model.device)
-    return view_evidence(model, views, rasterizer, background, clamp=ppl.clamp_render, **loss)

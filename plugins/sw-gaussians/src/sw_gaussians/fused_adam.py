@@ -1,54 +1,8 @@
-"""Adam whose step of the spherical harmonics a rasterizer may do in its backward pass; dense, as always."""
+"""Old import path of `sw_gaussians.fast.fused_adam`, for one release."""
 
-from __future__ import annotations
+import warnings
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from sw_gaussians.fast.fused_adam import OFFERED, FusingOptimizer
 
-import torch
-from torch import Tensor
-
-from splatwizard_core.api import SplatOptimizer
-from splatwizard_native import AdamUpdate, end_offer, offer_update
-
-if TYPE_CHECKING:
-    from splatwizard_core.api import RenderResult
-
-OFFERED = ("sh_dc", "sh_rest")
-"""48 of the 59 numbers of a Gaussian, drawn as they are stored: no activation stands between them and the kernel."""
-
-
-class FusingOptimizer(SplatOptimizer):
-    """Dense Adam. `offer` before a drawing saves writing and reading the gradients of spherical harmonics.
-
-    Source: Faster-GS (arXiv 2602.09999), whose fused backward pass and optimizer do so for all parameters.
-    """
-
-    _waiting: tuple[tuple[str, Tensor], ...] = ()
-
-    def offer(self) -> None:
-        """Let the coming backward pass do this step's updates; only where one drawing makes the whole gradient."""
-        params = [(name, getattr(self.model, name)) for name in OFFERED]
-        fit = [name for name, p in params if p.is_cuda and p.dtype == torch.float32 and p.is_contiguous()]
-        self._offer_all([name for name in fit if name in self.states])  # moments exist from the first update on
-
-    def _offer_all(self, names: Sequence[str]) -> None:
-        waiting = []
-        for name in names:
-            param, state = getattr(self.model, name), self.states[name]
-            group, moments = self.groups[name], state.tensors
-            update = AdamUpdate(
-                param.data, param.data, moments["exp_avg"], moments["exp_avg_sq"],
-                lr=group.lr, beta1=group.betas[0], beta2=group.betas[1], eps=group.eps, step=state.step + 1,
-            )  # fmt: skip
-            offer_update(param, update)
-            waiting.append((name, param))
-        self._waiting = tuple(waiting)
-
-    def step(self, result: RenderResult | None = None) -> None:
-        """Update every parameter that has a gradient; what the backward pass has done is counted."""
-        for name, param in self._waiting:
-            if not end_offer(param) and param.grad is None:  # with a gradient it is done, and counted, below
-                self.states[name].step += 1
-        self._waiting = ()
-        super().step(result)
+__all__ = ["OFFERED", "FusingOptimizer"]
+warnings.warn("sw_gaussians.fused_adam is sw_gaussians.fast.fused_adam now", DeprecationWarning, stacklevel=2)

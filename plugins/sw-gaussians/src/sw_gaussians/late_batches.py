@@ -1,37 +1,21 @@
 """Updates on the summed gradients of several views, for the end of a training: less noise, and less work for Adam."""
 
-from __future__ import annotations
+from splatwizard_core.api import SplatModel, SplatOptimizer
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
-
-from splatwizard_core.api import SplatOptimizer
-from sw_gaussians.cadence import gather
-
-if TYPE_CHECKING:
-    from splatwizard_native import AdamUpdate
-
-
-class BatchingOptimizer(SplatOptimizer):
-    """Dense Adam that adds gradients up while it `waits`, and then updates with the sum.
-
-    The sums follow rows that come, go or are put in another order, and are in checkpoints. Adam does not see the factor
-    between a sum and a mean, so learning rates stay as they are.
-    """
-
-    waits = False
-
-    def due(self) -> Iterator[tuple[str, AdamUpdate]]:
-        """Each parameter that is updated now, as `SplatOptimizer.due`."""
-        gather(self, list(self._group_of), update=not self.waits)
-        yield from super().due()
+PENDING = "pending"
+"""Key of a parameter's state: the sum of the gradients since its last update, of the parameter's shape."""
+AFTER_ALL = 100
+"""Priority behind all tasks that read or change gradients."""
 
 
 class SumViews:
-    """Lets the optimizer update at every `views`-th step, from step `first` on, with the sum of the views in between.
+    """Adds gradients up, and lets dense Adam update with their sum at every `views`-th step, from step `first` on.
 
     last    step that updates with what there is by then, be it fewer views; None: what is left is lost
 
+    A post task, to be registered with priority `AFTER_ALL`. The sums are part of the optimizer's state: they follow
+    rows that come, go or are put in another order, and are in checkpoints. Adam does not see the factor between a sum
+    and a mean, so learning rates stay as they are.
     Source: FastGS (arXiv 2511.04283). Raises ValueError for less than one view.
     """
 
@@ -40,6 +24,18 @@ class SumViews:
             raise ValueError(f"views is {views}: it must be at least 1")
         self.views, self.first, self.last = views, first, last
 
-    def __call__(self, optimizer: BatchingOptimizer, step: int) -> None:
-        whole = (step - self.first + 1) % self.views == 0
-        optimizer.waits = step >= self.first and step != self.last and not whole
+    def waits(self, step: int) -> bool:
+        """Return whether a step only adds its gradients."""
+        return step >= self.first and step != self.last and (step - self.first + 1) % self.views != 0
+
+    def __call__(self, model: SplatModel, optimizer: SplatOptimizer, step: int) -> None:
+        for name, param in model.named_parameters():
+            if param.grad is None or not any(name == g or name.startswith(f"{g}.") for g in optimizer.groups):
+                continue
+            state = optimizer.states.get(name)
+            kept = None if state is None else state.tensors.pop(PENDING, None)
+            if kept is not None:
+                param.grad = kept.add_(param.grad)
+            if self.waits(step):
+                state = state or optimizer.fresh_state(name, param)
+                state.tensors[PENDING], param.grad = param.grad, None

@@ -5,11 +5,11 @@ draws what the uninterrupted one drew there. At the last step nothing is moved: 
 """
 
 from splatwizard_core.api import GaussianModel, OptimizationParams, SplatOptimizer, TaskLog, stream
-from sw_gaussians import mcmc
+from sw_gaussians.density import mcmc
 
 
 class Relocate:
-    """Moves dead Gaussians onto live ones (sw_gaussians.mcmc.relocate); curve "relocated"."""
+    """Moves dead Gaussians onto live ones (sw_gaussians.density.mcmc.relocate); curve "relocated"."""
 
     def __init__(self, *, min_opacity: float = 0.005) -> None:
         self.min_opacity = min_opacity
@@ -25,7 +25,7 @@ class Relocate:
 
 
 class Grow:
-    """Adds Gaussians up to a cap (sw_gaussians.mcmc.grow); curve "added"."""
+    """Adds Gaussians up to a cap (sw_gaussians.density.mcmc.grow); curve "added"."""
 
     def __init__(self, *, cap: int = 1_000_000, growth: float = 0.05, min_opacity: float = 0.005) -> None:
         self.cap, self.growth, self.min_opacity = cap, growth, min_opacity
@@ -43,7 +43,7 @@ class Grow:
 
 
 class AddNoise:
-    """Shakes the means after each update (sw_gaussians.mcmc.add_noise).
+    """Shakes the means after each update (sw_gaussians.density.mcmc.add_noise).
 
     A pre task: what follows the update of step s - 1 happens at the start of step s, and before the task that sets the
     step size, so that it is still that of s - 1. Register it before "update lr".

@@ -1,4 +1,4 @@
-"""Sizes of the training pictures over time, as keys of any method whose own plan does not have those of `fast`."""
+"""Sizes of the training pictures over time, as keys of any method that trains from points."""
 
 from __future__ import annotations
 

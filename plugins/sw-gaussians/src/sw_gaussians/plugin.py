@@ -1,13 +1,25 @@
-"""Registers the tasks of 3DGS, of 3DGS-MCMC and of volume masks, a pruner, and the .ply of 3DGS."""
+"""Registers density controls, the tasks of 3DGS, of 3DGS-MCMC and of volume masks, a pruner, and the .ply of 3DGS."""
 
 from splatwizard_core.api import Registry, hookimpl
 
 
 @hookimpl
+def register_density_controls(registry: Registry) -> None:
+    registry.add("adc", "sw_gaussians.density.adc:AdaptiveDensityControl",
+                 summary="clone, split and prune by screen-space gradients, reset opacities (3DGS, AbsGS)",
+                 native="sw_gaussians.native:GAUSSIANS")  # fmt: skip
+    registry.add("mcmc", "sw_gaussians.density.mcmc:MCMC",
+                 summary="relocate and add Gaussians up to a cap, shake them (3DGS-MCMC)")  # fmt: skip
+    registry.add("budget", "sw_gaussians.density.budget:BudgetControl",
+                 summary="add Gaussians within a budget, drawn by a score (LiteGS)",
+                 native="sw_gaussians.native:GAUSSIANS")  # fmt: skip
+
+
+@hookimpl
 def register_tasks(registry: Registry) -> None:
-    registry.add("update-lr", "sw_gaussians.tasks:UpdateLearningRate",
+    registry.add("update-lr", "sw_gaussians.learning_rate:UpdateLearningRate",
                  summary="exponential decay of the means' step size, times the scene extent", factory=True)  # fmt: skip
-    registry.add("increase-sh-degree", "sw_gaussians.tasks:increase_sh_degree",
+    registry.add("increase-sh-degree", "sw_gaussians.stage:increase_sh_degree",
                  summary="activate one more band of spherical harmonics", factory=False)  # fmt: skip
     registry.add("collect-gradient-statistics", "sw_gaussians.statistics:collect_statistics",
                  summary="add up screen-space gradients (needs grad2d, or absgrad)", factory=False,
@@ -28,7 +40,7 @@ def register_tasks(registry: Registry) -> None:
     registry.add("add-position-noise", "sw_gaussians.mcmc_tasks:AddNoise",
                  summary="shake the means of faint Gaussians after each update (3DGS-MCMC)", factory=True)  # fmt: skip
 
-    registry.add("collect-opacity-gradients", "sw_gaussians.fragments:collect_opacity_gradients",
+    registry.add("collect-opacity-gradients", "sw_gaussians.density.fragments:collect_opacity_gradients",
                  summary="add up opacity gradients and their squares over fragments (needs fragment_grad)",
                  factory=False)  # fmt: skip
     registry.add("densify-to-budget", "sw_gaussians.fast_tasks:DensifyToBudget",
@@ -39,7 +51,7 @@ def register_tasks(registry: Registry) -> None:
                  summary="remove what is faint, or what several views blame for their errors (FastGS)",
                  factory=True)  # fmt: skip
     registry.add("sum-views", "sw_gaussians.late_batches:SumViews",
-                 summary="update on the summed gradients of several views (needs late_batches.BatchingOptimizer)",
+                 summary="update on the summed gradients of several views (dense Adam)",
                  factory=True)  # fmt: skip
     registry.add("average-parameters", "sw_gaussians.averaging:AverageParameters",
                  summary="make a model the mean of itself over the last steps", factory=True)  # fmt: skip

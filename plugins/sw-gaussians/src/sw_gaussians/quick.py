@@ -15,9 +15,9 @@ QUICK: Mapping[str, Any] = {
     "lr.sh_rest": 1e-3,
     "lr.scales": 1e-2,
     "lr.quats": 2e-3,
-    "densify.start": 200,
-    "densify.stop": 1200,
-    "densify.grad_threshold": 4e-4,
+    "density.settings.start": 200,
+    "density.settings.stop": 1200,
+    "density.settings.grad_threshold": 4e-4,
 }
 """No opacity reset, and larger steps, since there are few.
 

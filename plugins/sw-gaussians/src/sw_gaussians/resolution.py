@@ -83,11 +83,6 @@ class ResolutionPlan:
         p0, p1 = self.scales[at - 1] ** -2, self.scales[at] ** -2
         return float((p0 + (step - t0) / (t1 - t0) * (p1 - p0)) ** -0.5)
 
-    @property
-    def coarse_until(self) -> int:
-        """Step of the last level with pictures of half the width or less; 0 if the first is the last, or has larger."""
-        return max((time for time, scale in zip(self.times, self.scales, strict=True) if scale >= 2), default=0)
-
 
 def first_scale(spectrum: Spectrum) -> float:
     """Return the scale at which one picture holds its first share of the amplitudes."""

@@ -72,6 +72,7 @@ def surfels_from_points(
     generator: torch.Generator,
     max_sh_degree: int = 3,
     opacity: float = 0.1,
+    scale_factor: float = 1.0,
     rotation: Rotation = "uniform4",
 ) -> SurfelModel:
     """Make one round surfel for each point, as large as the distance to its three nearest neighbours.
@@ -79,6 +80,7 @@ def surfels_from_points(
     points      xyz [P,3]; points that are not finite are dropped with a warning; missing colours are grey
     generator   of the rotations, on the CPU
     opacity     initial opacity, 0..1
+    scale_factor    multiplies the initial standard deviations
     rotation    "uniform4": four numbers in [0,1), as the authors' code, which is no uniform rotation; "haar": a
                 uniform rotation; "identity": all normals along z
 
@@ -98,7 +100,7 @@ def surfels_from_points(
         sh_dc,
         xyz.new_zeros(n, (max_sh_degree + 1) ** 2 - 1, 3),
         xyz.new_full((n,), logit(opacity)),
-        distances.log()[:, None].repeat(1, 2),
+        (distances * scale_factor).log()[:, None].repeat(1, 2),
         quats.to(xyz),
         active_sh_degree=0,
     )

@@ -6,10 +6,12 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.api import GaussianModel, RenderResult
-from sw_gaussians.native import GAUSSIANS
+from sw_gaussians.fast import statistics as fast
 
 GRADIENT_STATISTICS = ("grad_accum", "denom")
 """Buffers of a GaussianModel: sum of the gradients' lengths, and over how many views."""
+STATISTICS = (*GRADIENT_STATISTICS, "max_radii2d")
+"""These, and the largest radius on screen: what `collect_statistics` brings up to date."""
 
 
 def accumulate_statistics(model: GaussianModel, gradients: Tensor, radii: Tensor) -> None:
@@ -17,13 +19,8 @@ def accumulate_statistics(model: GaussianModel, gradients: Tensor, radii: Tensor
 
     gradients   [N,2] derivative of the loss by the projected centre, NDC units (RenderResult.grad2d or absgrad2d)
     radii       [N] pixels, 0 = not visible
-
-    On CUDA one kernel does it: the same sums, to the last bit of a root.
     """
-    sums = model.grad_accum, model.denom, model.max_radii2d
-    if _fits_kernel(gradients, radii, sums) and GAUSSIANS.has_cuda():
-        torch.ops.splatwizard_gaussians.view_statistics(gradients, radii, *sums)
-    else:
+    if not fast.accumulate(model, gradients, radii):
         accumulate_in_torch(model, gradients, radii)
 
 
@@ -42,16 +39,6 @@ def accumulate_in_torch(model: GaussianModel, gradients: Tensor, radii: Tensor) 
     torch.maximum(model.max_radii2d, radii.to(model.max_radii2d.dtype), out=model.max_radii2d)
 
 
-def _fits_kernel(gradients: Tensor, radii: Tensor, sums: tuple[Tensor, ...]) -> bool:
-    return (
-        gradients.is_cuda
-        and radii.dtype == torch.int32
-        and radii.is_contiguous()
-        and gradients.data_ptr() % 8 == 0
-        and all(t.dtype == torch.float32 and t.is_contiguous() for t in (gradients, *sums))
-    )
-
-
 def collect_statistics(model: GaussianModel, result: RenderResult) -> None:
     """Schedule task: add this view's screen-space gradients to the model's statistics.
 
@@ -61,7 +48,7 @@ def collect_statistics(model: GaussianModel, result: RenderResult) -> None:
     if gradients is None:
         raise ValueError(
             "gradient statistics need a stage that renders them, with RasterOptions(grad2d=True) or absgrad=True "
-            "(that of 3DGS does, unless mcmc.enabled)"
+            "(that of 3DGS does where its density control asks for them: adc and budget do)"
         )
     accumulate_statistics(model, gradients.value, result.radii)
 

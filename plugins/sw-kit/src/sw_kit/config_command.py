@@ -120,13 +120,12 @@ def type_name(annotation: Any) -> str:
 
 
 def _settings_model(block: BaseModel, plugins: PluginManager) -> type[BaseModel] | None:
-    """The pydantic model of the settings of what a block names: its codec, or its pruner."""
-    for name, kind in (("name", "coder"), ("pruner", "pruner")):
-        chosen = getattr(block, name, None)
-        if isinstance(chosen, str) and chosen in plugins.registries[kind]:
-            found: type[BaseModel] | None = getattr(plugins.registries[kind].load(chosen), "Settings", None)
-            return found
-    return None
+    """Return the pydantic model of the settings of what a block names; None if there is none."""
+    from sw_gaussians.choices import Choice
+
+    chosen = block.provider(plugins, "") if isinstance(block, Choice) else None
+    found: type[BaseModel] | None = getattr(chosen, "Settings", None)
+    return found
 
 
 def _imported(target: str) -> type[BaseModel]:

@@ -11,33 +11,26 @@ STANDARD_FEATURES = [
     "FLOAT64", "DETERMINISTIC", "FRAGMENT_GRAD",
 ]  # fmt: skip
 
+SCORES = [
+    "SCORE_HITS", "SCORE_OPACITY", "SCORE_OPACITY_T", "SCORE_BLEND", "SCORE_BLEND_MAX", "SCORE_GAMMA", "SCORE_DIST",
+    "SCORE_PIXEL_WEIGHT", "SCORE_GRAD_SQ", "FISHER",
+]  # fmt: skip
+# A derivative of three colours, without that of the antialias factor; log scales need scales.
+SCORES_FORBIDDEN = [
+    ["COLORS_ND", "SCORE_GRAD_SQ"], ["COLORS_ND", "FISHER"], ["ANTIALIAS", "FISHER"], ["COV3D", "FISHER"],
+]  # fmt: skip
+ALIASES = ["accel", "depth", "count", "speedy", "pup", "mesongs", "trimgs"]
+"""Rasterizers of papers whose additions `standard` has: Taming 3DGS, hierarchical 3DGS, LightGaussian, Speedy-Splat,
+PUP 3D-GS, MesonGS, TrimGS."""
+
 ON_CUDA = {"lacks": ["FLOAT64"], "available": "sw_rasterizers.native:unavailable_on_cuda"}
-# Name -> (target, summary, features, speed). The same kernels under the names of what needs them; the speeds only rank
-# the others below `standard`, which serves whatever nobody asks for by name, codebooks excepted.
+# Name -> (target, summary, features, speed). The speed only ranks `c3dgs` below `standard`, codebooks excepted.
 STANDARD = {
     "standard": (
         "standard:StandardRasterizer",
-        "compiled 3DGS rasterizer: CPU, vectorised and multi-threaded, and CUDA",
-        STANDARD_FEATURES,
+        "compiled 3DGS rasterizer with scores of Gaussians: CPU, vectorised and multi-threaded, and CUDA",
+        [*STANDARD_FEATURES, *SCORES],
         50,
-    ),
-    "accel": (
-        "variants:AccelRasterizer",
-        "the kernels of standard for training: split SH, exact tiles (Taming 3DGS)",
-        [
-            "BACKWARD", "ABSGRAD", "VISIBLE_FILTER", "SPLIT_SH", "TIGHT_TILES", "COLORS_ND", "FLOAT64", "DETERMINISTIC",
-            "FRAGMENT_GRAD",
-        ],
-        44,
-    ),
-    "depth": (
-        "variants:DepthRasterizer",
-        "the kernels of standard for depth: inverse, accumulated, expected, median; antialiased",
-        [
-            "BACKWARD", "ANTIALIAS", "VISIBLE_FILTER", "SPLIT_SH", "DEPTH_INVERSE", "DEPTH_ACCUM", "DEPTH_EXPECTED",
-            "DEPTH_MEDIAN", "ALPHA_MAP", "FLOAT64", "DETERMINISTIC",
-        ],
-        43,
     ),
     "c3dgs": (
         "variants:IndexedRasterizer",
@@ -61,27 +54,10 @@ INFERENCE = {
     "tcgs": ("TensorCoreRasterizer", "TC-GS-style, exponents by tensor cores", "approx-fp16", 60),
 }
 
-CONTRIBUTIONS = [
-    "SCORE_HITS", "SCORE_OPACITY", "SCORE_OPACITY_T", "SCORE_BLEND", "SCORE_BLEND_MAX", "SCORE_GAMMA", "SCORE_DIST",
-    "SCORE_PIXEL_WEIGHT",
-]  # fmt: skip
-# Name -> (target, summary, scores, speed). One set of kernels under the names of what needs them; the speeds only rank
-# them below `standard` and by how much beyond a request each one offers.
-SCORING = {
-    "mesongs": ("MesonRasterizer", "MesonGS' importance", ["SCORE_BLEND", "SCORE_PIXEL_WEIGHT"], 49),
-    "trimgs": ("TrimRasterizer", "TrimGS' contribution", ["SCORE_HITS", "SCORE_GAMMA", "SCORE_PIXEL_WEIGHT"], 48),
-    "count": ("CountRasterizer", "all contribution sums, LightGaussian's among them", CONTRIBUTIONS, 47),
-    "speedy": ("SpeedyRasterizer", "Speedy-Splat's squared derivatives", [*CONTRIBUTIONS, "SCORE_GRAD_SQ"], 46),
-    "pup": ("PupRasterizer", "PUP 3D-GS' Fisher blocks", [*CONTRIBUTIONS, "SCORE_GRAD_SQ", "FISHER"], 45),
-}
-# A derivative of three colours, without that of the antialias factor; log scales need scales.
-SCORING_FORBIDDEN = [
-    ["COLORS_ND", "SCORE_GRAD_SQ"], ["COLORS_ND", "FISHER"], ["ANTIALIAS", "FISHER"], ["COV3D", "FISHER"],
-]  # fmt: skip
-
 
 @hookimpl
 def register_rasterizers(registry: Registry) -> None:
+    of = {"standard": {"aliases": ALIASES, "combos_forbidden": SCORES_FORBIDDEN}, "c3dgs": {"kernels": "standard"}}
     for name, (target, summary, features, speed) in STANDARD.items():
         registry.add(
             name,
@@ -96,7 +72,7 @@ def register_rasterizers(registry: Registry) -> None:
             exactness="exact",
             speed=speed,
             native="sw_rasterizers.native:MODULE",
-            **({} if name == "standard" else {"kernels": "standard"}),
+            **of[name],
         )
     registry.add(
         "2dgs",
@@ -127,21 +103,4 @@ def register_rasterizers(registry: Registry) -> None:
             speed=speed,
             min_cc=[8, 0],  # copies past the registers and products of tensor cores
             native="sw_rasterizers.native:MODULE",
-        )
-    for name, (target, summary, scores, speed) in SCORING.items():
-        registry.add(
-            name,
-            f"sw_rasterizers.scoring:{target}",
-            summary=f"compiled 3DGS rasterizer with scores of Gaussians: {summary}",
-            devices=["cpu", "cuda"],
-            dtypes=["float32", "float64"],
-            features=[*STANDARD_FEATURES, *scores],
-            combos_forbidden=[combo for combo in SCORING_FORBIDDEN if combo[1] in scores],
-            available="sw_rasterizers.native:unavailable",
-            on={"cuda": ON_CUDA},
-            profiles=PROFILES,
-            exactness="exact",
-            speed=speed,
-            native="sw_rasterizers.native:MODULE",
-            kernels="standard",
         )

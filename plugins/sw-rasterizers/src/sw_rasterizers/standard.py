@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterable
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -13,7 +14,6 @@ from splatwizard_core.api import (
     Camera,
     CapabilityError,
     ConfigError,
-    Feature,
     GaussianInputs,
     GradBuffer,
     RasterizerInfo,
@@ -24,6 +24,7 @@ from splatwizard_core.api import (
 )
 from sw_rasterizers import plugin
 from sw_rasterizers.ops import Call, Flag, camera_numbers, rasterize, visible_radii
+from sw_rasterizers.scoring import Totals, add_scores, check_count
 
 CUDA_CHANNELS = 8
 """`kMaxChunk` of csrc/cuda/kernels.h."""
@@ -35,6 +36,7 @@ class StandardRasterizer:
     Profile "3dgs" draws the exact support of every splat, alpha >= 1/255 wherever it reaches, as the reference does.
     Profile "dgr-exact" also cuts each splat at the original's square of 16x16 tiles (3 sigma) and takes over the
     original's gradients through the clamps of alpha and of the Jacobian.
+    Scores of Gaussians are formed in a pass of their own, and only where they are asked for.
 
     count   also count evaluated and blended pixel-splat pairs into the statistics, and on CUDA measure the stages
             (those of the backward pass are in `ops.backward_seconds()`); slow, for benchmarks
@@ -48,6 +50,10 @@ class StandardRasterizer:
     def render(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> RenderResult:
         """Draw one view; see the protocol. Raises CapabilityError, ConfigError or ShapeError."""
         self.info.check_request(g, opt)
+        if opt.scores or opt.fisher:
+            found = self.accumulate(g, [cam], opt)
+            result = self.render(g, cam, replace(opt, scores=(), fisher=False))
+            return replace(result, scores=found.scores, fisher=found.fisher)
         call = self._call(g, cam, opt)
         if g.colors is not None and g.colors.shape[1] == 0 and g.features is None and not opt.depth:
             raise ShapeError("GaussianInputs.colors has no channel: there is nothing to draw", actual=g.colors.shape)
@@ -116,9 +122,18 @@ class StandardRasterizer:
 
     @torch.no_grad()
     def accumulate(self, g: GaussianInputs, cams: Iterable[Camera], opt: RasterOptions) -> AccumOutput:
-        """No score is declared: raises CapabilityError for any that is asked for."""
-        self.info.check_offered(Feature.asked_by(opt))
-        return AccumOutput({})
+        """Sum scores and Fisher blocks over views ("blend_max": their maximum); no image is kept."""
+        self.info.check_request(g, opt)
+        check_count(opt.scores)
+        if g.colors is not None and g.colors.shape[1] == 0:
+            raise ShapeError("GaussianInputs.colors has no channel: there is nothing to draw", actual=g.colors.shape)
+        totals = Totals(g, opt)
+        plain = replace(opt, depth=frozenset(), alpha=False, absgrad=False, fragment_grad=False, grad2d=False)
+        for cam in cams:
+            opt.check_scores(cam)
+            if opt.scores or opt.fisher:
+                add_scores(g, self._call(g, cam, plain), opt, totals)
+        return totals.result()
 
     def _call(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> Call:
         flags = _flags(

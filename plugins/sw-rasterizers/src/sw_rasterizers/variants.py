@@ -1,4 +1,4 @@
-"""The standard kernels under the names of the variants that ask for nothing beyond them, and with codebooks."""
+"""The standard kernels with codebooks of colours and shapes."""
 
 from __future__ import annotations
 
@@ -12,25 +12,6 @@ from sw_rasterizers import plugin
 from sw_rasterizers.segments import Tables
 from sw_rasterizers.shared_colors import shared_colors
 from sw_rasterizers.standard import StandardRasterizer
-
-
-class AccelRasterizer(StandardRasterizer):
-    """Split SH, exact tiles and a backward pass without an atomic per pixel: what `standard` does anyway.
-
-    Source: Taming 3DGS (arXiv 2406.15643). Its checkpoints per 32 splats are not needed: the kernels go back to front
-    from the final transmittance.
-    """
-
-    info = RasterizerInfo.declared(plugin.register_rasterizers, "accel")
-
-
-class DepthRasterizer(StandardRasterizer):
-    """Inverse, accumulated, expected and median depth, and the antialias factor: `standard` draws them itself.
-
-    Source: hierarchical 3DGS (arXiv 2406.12080) for the inverse depth, Mip-Splatting (arXiv 2311.16493) for the factor.
-    """
-
-    info = RasterizerInfo.declared(plugin.register_rasterizers, "depth")
 
 
 class IndexedRasterizer(StandardRasterizer):

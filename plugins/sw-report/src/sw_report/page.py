@@ -15,7 +15,7 @@ from urllib.parse import quote
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from splatwizard_core.tooling import write_atomic
+from splatwizard_core.tooling import as_installed, write_atomic
 from sw_report import numbers, plots
 from sw_report import results_tables as tables
 from sw_report.aggregate import dataset_tables
@@ -89,6 +89,8 @@ def render_page(collection: Collection, options: PageOptions, folder: Path | Non
     environment = Environment(
         loader=PackageLoader("sw_report"), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
+        # Advice as the terminal gives it; what is marked up already is ours.
+        finalize=lambda value: as_installed(value) if type(value) is str else value,
     )  # fmt: skip
     environment.filters["unbroken"] = _unbroken
     environment.filters["capfirst"] = lambda text: text[:1].upper() + text[1:]

@@ -17,8 +17,8 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "prune.interval": 500,
         "base.preset": "quick",
         "base.lr.max_steps": 2500,
-        "base.densify.stop": 1500,
-        "base.densify.grad_threshold": 3e-4,
+        "base.density.settings.stop": 1500,
+        "base.density.settings.grad_threshold": 3e-4,
     },
 }
 

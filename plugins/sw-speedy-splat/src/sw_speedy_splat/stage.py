@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sw_gaussians.fast_tasks import DensifyToBudget, HalveOpacity
+from sw_gaussians.control_tasks import Adjust, Change
 from sw_gaussians.finetune.pruning import PruneByScore
+from sw_gaussians.stage import ThreeDGSStage
 from sw_gaussians.statistics import collect_statistics
-from sw_gaussians.tasks import PruneAndDensify, ResetOpacity
 from sw_gaussians.wrapped_stage import WrappedStage
 
 if TYPE_CHECKING:
@@ -31,7 +31,8 @@ class SpeedySplatStage(WrappedStage):
         super().__init__(inner, config)
         self.name = "speedy-splat"
         self.config = config
-        self.densify_stop: int = base.config.densify.stop
+        assert isinstance(inner, ThreeDGSStage)
+        self.densify_stop = inner.control.until
         self.pruner = config.prune.load(plugins)
 
     @property
@@ -61,9 +62,8 @@ class SpeedySplatStage(WrappedStage):
 
     def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
         super().register_post_task(scheduler, ppl, opt)
-        for densifies, resets in ((PruneAndDensify, ResetOpacity), (DensifyToBudget, HalveOpacity)):
-            scheduler.reprioritise(densifies, DENSIFY)
-            scheduler.reprioritise(resets, RESET)
+        scheduler.reprioritise(Adjust, DENSIFY)
+        scheduler.reprioritise(Change, RESET)
         soft, hard = self.config.prune.soft, self.config.prune.hard
         statistics = self.pruner.uses_statistics
         if self.soft_plan and soft > 0:

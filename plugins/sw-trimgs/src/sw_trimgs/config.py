@@ -13,7 +13,7 @@ from splatwizard_core.api import Params
 from sw_trimgs.scale_split import Box
 
 
-class FlatConfig(Choosing, GaussianTraining):
+class FlatConfig(GaussianTraining):
     """Everything that can be set for 3DGS with flat Gaussians."""
 
     sh_degree: int = Field(3, ge=0, le=3, description="highest degree of the spherical harmonics")

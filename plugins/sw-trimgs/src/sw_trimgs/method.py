@@ -40,12 +40,13 @@ class Flat3DGS(GaussianMethod):
         """Flat Gaussians, one for each start point of the scene, all facing along x. Raises SceneError."""
         config: FlatConfig = self.config
         points = start_points(scene, self.name)
-        round_ones = gaussians_from_points(points, max_sh_degree=config.sh_degree, **config.mcmc.first_values())
+        start = config.density.load(self.plugins).start_values()
+        round_ones = gaussians_from_points(points, max_sh_degree=config.sh_degree, **start)
         tensors = [getattr(round_ones, name).detach() for name in round_ones.RAW]
         return FlatGaussians(*tensors, active_sh_degree=0)
 
     def stages(self) -> Sequence[Stage]:
-        return [FlatStage(self.config)]
+        return [FlatStage(self.config, self.config.density.load(self.plugins))]
 
 
 class Trim3DGS(GaussianMethod):

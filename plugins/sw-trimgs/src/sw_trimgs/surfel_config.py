@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 
 from pydantic import Field
 from sw_gaussians.choices import Choosing, CodecChoice
+from sw_gaussians.older_keys import within
 from sw_gaussians.surface_losses import NormalTerm
 
 from splatwizard_core.api import Params
@@ -87,6 +88,10 @@ class ScratchConfig(Choosing):
     trim: ScratchTrimming = Field(ScratchTrimming(), description="removal of what contributes least")
     surface: ScratchSurface = Field(ScratchSurface(), description="losses of the surface")
     base: dict[str, Any] = Field(
-        {}, description="values of 2dgs by its keys (base.densify.grad_threshold=4e-4), and its preset (base.preset)"
+        {},
+        description="values of 2dgs by its keys (base.density.settings.interval=50), its preset (base.preset)",
     )
     codec: CodecChoice = Field(CodecChoice(name="gaussians-exact"), description="what writes the file")
+
+    def translated(self, values: dict[str, Any]) -> dict[str, Any]:
+        return within(values, "base.")

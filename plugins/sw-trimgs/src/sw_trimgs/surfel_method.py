@@ -53,10 +53,11 @@ class Trim2DGSScratch(GaussianMethod):
         own: dict[str, Any] = {
             "iterations": config.iterations,
             "scale_schedule": config.scale_schedule,
-            "densify.world_prune": NO_SIZE_RULE,
             "surface.lambda_dist": config.surface.lambda_dist,
             "surface.lambda_normal": 0.0,  # ours leaves out edges
         }
+        if values.get("density", values.get("density.name", "adc")) == "adc" or "settings" in values.get("density", {}):
+            own["density.settings.world_prune"] = NO_SIZE_RULE
         if config.surface.depth_ratio is not None:
             own["surface.depth_ratio"] = config.surface.depth_ratio
         taken = next((key for key in own if _holds(values, key)), None)

@@ -7,11 +7,12 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
+from sw_gaussians.control_tasks import Change
+from sw_gaussians.density import AdaptiveDensityControl
 from sw_gaussians.stage import ThreeDGSStage
 from sw_gaussians.surface import surface_depth
 from sw_gaussians.surface_losses import add_surface_losses, maps_for
 from sw_gaussians.surfels import Surface, SurfelModel
-from sw_gaussians.tasks import PruneAndDensify, ResetOpacity
 from sw_gaussians.wrapped_stage import WrappedStage
 
 from splatwizard_core.api import EmptyModel, RasterOptions, UserInputError
@@ -166,16 +167,16 @@ class ScratchStage(WrappedStage):
 
     def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
         super().register_post_task(scheduler, ppl, opt)
-        scheduler.reprioritise(ResetOpacity, RESET)
+        scheduler.reprioritise(Change, RESET)
         split = self.config.densify
         assert isinstance(self.inner, ThreeDGSStage)
-        control = self.inner.densification()
-        assert isinstance(control, PruneAndDensify)
+        control, lr = self.inner.control, self.inner.config.lr.opacity
         task = ScaleSplit(
             percent_dense=split.percent_dense,
             factor=split.factor,
             size_px=None,
-            min_opacity=control.settings["min_opacity"],  # lower where a scaled plan leaves few steps after a reset
+            # As 2DGS prunes: lower where a scaled plan leaves few steps after a reset.
+            min_opacity=control.min_opacity(lr) if isinstance(control, AdaptiveDensityControl) else 0.0,
             box=split.box,
         )
         steps = self.when(range(split.start, split.stop, split.interval))

@@ -80,13 +80,15 @@ def _declared(context: click.Context, field: str) -> list[str]:
 
 def _keys(context: click.Context) -> dict[str, str | None]:
     """Keys of --set: of these methods, which are imported for it, of the run and of the scene."""
+    from splatwizard_core.plugins import load_plugins
     from splatwizard_core.training.keys import block_keys
     from splatwizard_core.training.params import PipelineParams, SceneParams
 
     found: dict[str, str | None] = {}
     for entry in _methods(context):
         with contextlib.suppress(Exception):  # one that is broken offers nothing
-            found |= block_keys(entry.load().Config)
+            config = entry.load().Config
+            found |= {**block_keys(config), **config().settings_keys(load_plugins())}
     return {f"{key}=": told for key, told in (found | block_keys(PipelineParams) | block_keys(SceneParams)).items()}
 
 

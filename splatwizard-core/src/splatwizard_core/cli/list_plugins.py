@@ -57,7 +57,8 @@ def _print(found: dict[str, Any], *, verbose: bool) -> None:
         for entry in row["provides"]:
             default = " (default)" if entry.get("default") else ""
             kernels = f" (kernels of {escape(str(entry['kernels']))})" if entry.get("kernels") else ""
-            by_kind.setdefault(entry["kind"], []).append(escape(entry["name"]) + default + kernels)
+            also = f" (also {escape(', '.join(entry['aliases']))})" if entry.get("aliases") else ""
+            by_kind.setdefault(entry["kind"], []).append(escape(entry["name"]) + default + kernels + also)
         lines = [f"[bold]{kind}[/bold]: {', '.join(names)}" for kind, names in by_kind.items()]
         if verbose:
             lines = [f"[bold]{e['kind']}[/bold] {escape(e['name'])}: {escape(e['summary'])}" for e in row["provides"]]

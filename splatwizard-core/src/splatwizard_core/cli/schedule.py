@@ -34,6 +34,7 @@ def schedule(method: str, verbose: bool, as_json: bool, chosen: Choices) -> None
     """
     from splatwizard_core.plugins.origins import Origins
     from splatwizard_core.runs.phases import stage_parts
+    from splatwizard_core.runs.pretrained import planned_stages
     from splatwizard_core.training.plan import format_plan, plan_rows
     from splatwizard_core.training.scheduler import build_schedulers
 
@@ -42,7 +43,7 @@ def schedule(method: str, verbose: bool, as_json: bool, chosen: Choices) -> None
     resolved = replace(chosen, methods=(method,), preset=preset).resolve_one(plugins)
     tell_data_set_values([resolved])
     entry, origins = plugins.methods.entry(method), Origins(plugins)
-    stages = list(plugins.methods.load(method)(plugins, resolved.config).stages())
+    stages = planned_stages(plugins, resolved)
     found: list[dict[str, Any]] = []
     for stage in stages:
         pre, post = build_schedulers(stage, resolved.ppl)

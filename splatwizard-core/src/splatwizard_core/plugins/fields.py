@@ -12,7 +12,7 @@ TEXTS = (
     "label", "group", "unit", "settings", "suffix", "codes", "stores", "looks_for", "without_poses", "title", "prefix",
 )  # fmt: skip
 NUMBERS = ("position", "digits", "bd_anchor")
-LISTS = ("presets", "rates", "scenes", "table_scenes", "folders")
+LISTS = ("aliases", "presets", "rates", "scenes", "table_scenes", "folders")
 
 
 def illegal(kind: str, name: object, declared: Mapping[str, Any]) -> str | None:

@@ -60,6 +60,11 @@ def register_tasks(registry: Registry) -> None:
 
 
 @hookspec
+def register_density_controls(registry: Registry) -> None:
+    """Add density controls: subclasses of splatwizard_core.api.DensityControl, made with their settings."""
+
+
+@hookspec
 def register_methods(registry: Registry) -> None:
     """Add methods: subclasses of splatwizard_core.api.Method, with their presets and rate points."""
 

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from splatwizard_core.plugins.check import Check
     from splatwizard_core.rendering.rasterizer import Rasterizer
     from splatwizard_core.scene.dataset import Dataset
+    from splatwizard_core.training.density import DensityControl
     from splatwizard_core.training.pruner import Pruner
 
 log = logging.getLogger(__name__)
@@ -69,6 +70,7 @@ class PluginManager:
         self.vector_coders: Coders[VectorCoder] = Coders(self.coders, "vectors")
         self.gaussian_codecs: Coders[GaussianCodec] = Coders(self.coders, "gaussians")
         self.tasks: TypedRegistry[Callable[..., Any]] = TypedRegistry("task")
+        self.density_controls: TypedRegistry[Callable[..., DensityControl]] = TypedRegistry("density control")
         self.methods: TypedRegistry[type[Method]] = TypedRegistry("method")
         self.datasets: TypedRegistry[type[Dataset] | Dataset] = TypedRegistry("dataset")
         self.metrics: TypedRegistry[AnyMetric] = TypedRegistry("metric")

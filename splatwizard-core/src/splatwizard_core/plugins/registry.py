@@ -86,7 +86,8 @@ class Registry:
 
         target      "module:attribute"; it is not imported now
         summary     one line
-        declared    fields of the kind, plain values that can be printed as JSON
+        declared    fields of the kind, plain values that can be printed as JSON; `aliases` of an entry of ours are
+                    further names that it is asked for by
 
         A name of ours stays ours. One that two others claim belongs to neither: asking for it is an error that names
         both. An entry with a name or a field that is not legal is refused alone.
@@ -134,8 +135,14 @@ class Registry:
         """Names that several distributions claim; asking for one is an error."""
         return {name: sorted(found, key=lambda e: e.distribution) for name, found in self._clashes.items()}
 
+    @property
+    def aliases(self) -> dict[str, Entry]:
+        """Further names of entries of ours, those aside that are an entry's own."""
+        named = ((alias, e) for e in self if not e.foreign for alias in e.declared.get("aliases", ()))
+        return {alias: entry for alias, entry in named if alias not in self._entries}
+
     def __contains__(self, name: object) -> bool:
-        return name in self._entries
+        return name in self._entries or name in self.aliases
 
     def __iter__(self) -> Iterator[Entry]:
         return iter(sorted(self._entries.values(), key=lambda e: e.name))
@@ -145,8 +152,8 @@ class Registry:
 
     @property
     def names(self) -> list[str]:
-        """Sorted names that can be asked for."""
-        return sorted(self._entries)
+        """Sorted names that can be asked for, aliases included."""
+        return sorted({*self._entries, *self.aliases})
 
     def of_suffix(self, path: object) -> str | None:
         """Name of the entry whose declared suffix a path has: of ours before others', then the longest; else None."""
@@ -159,12 +166,13 @@ class Registry:
         return next((e.name for e in self if e.declared.get("default") and is_ours(e.distribution)), None)
 
     def entry(self, name: str) -> Entry:
-        """The entry called `name`.
+        """The entry called `name`, or of which that is an alias.
 
         Raises PluginError that names the package to install, or suggests the nearest installed name.
         """
-        if name in self._entries:
-            return self._entries[name]
+        found = self._entries.get(name) or self.aliases.get(name)
+        if found is not None:
+            return found
         if name in self._clashes:
             owners = " and ".join(f"{e.distribution} {e.version}" for e in self.clashes[name])
             raise PluginError(

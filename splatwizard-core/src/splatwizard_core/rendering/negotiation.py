@@ -38,7 +38,7 @@ class NegotiatedRasterizer:
     plugins     where rasterizers are registered
     device      where the tensors will be
     prefer      names to take first if they can serve, best first (the user's choice)
-    forbid      names never to take
+    forbid      names never to take; an alias stands for the rasterizer that it names, here and everywhere
     exactness   which kinds of result are acceptable from one that nobody prefers by name
     suggested   further names to prefer, after `prefer`, ignored where not installed (a method's or a file's own choice)
     options     values of RasterOptions that hold in place of each request's own (the user's choice)
@@ -69,11 +69,10 @@ class NegotiatedRasterizer:
         """Names of the rasterizers that served a request; clear it to learn which ones serve from then on."""
         self._registry = plugins.rasterizers
         self._prefer = [self._registry.entry(name).name for name in prefer]
-        self._prefer += [name for name in suggested if name in self._registry and name not in self._prefer]
+        self._prefer += [self._registry.entry(name).name for name in suggested if name in self._registry]
         self._forbid = {self._registry.entry(name).name for name in forbid}
-        self._forced = os.environ.get("SW_RASTERIZER") or None
-        if self._forced is not None:
-            self._registry.entry(self._forced)
+        forced = os.environ.get("SW_RASTERIZER")
+        self._forced = self._registry.entry(forced).name if forced else None
         self._exactness = frozenset(exactness)
         self._chosen: dict[frozenset[str], Rasterizer] = {}
         self._failed: dict[str, str] = {}

@@ -323,7 +323,8 @@ def resolve(
             elif key.startswith(METRICS) and key.count(".") > 1:
                 set_at(settings, key.removeprefix(METRICS), value)
             else:
-                raise unknown_key(key, [k for block in reversed(given) for k in block_keys(block)], source)
+                known = [k for block in reversed(given) for k in block_keys(block)]
+                raise unknown_key(key, [*known, *config.settings_keys(plugins)], source)
             provenance[key] = source
         config = apply_overrides(config, given[method.Config], source=source)
         ppl = apply_overrides(ppl, given[PipelineParams], source=source)

@@ -21,9 +21,11 @@ from splatwizard_core.gaussians.sound import leave_out_senseless
 from splatwizard_core.method import Method
 from splatwizard_core.plugins import PluginManager, load_plugins
 from splatwizard_core.runs.config import INIT, ResolvedConfig, resolve
+from splatwizard_core.training.added_tasks import add_tasks
 from splatwizard_core.training.keys import field_at, input_files, is_beside_method, value_at
 from splatwizard_core.training.overrides import apply_overrides
 from splatwizard_core.training.params import PipelineParams
+from splatwizard_core.training.stage import Stage
 
 PRESET = "preset"  # `pretrained.preset`: of the method that is started from
 
@@ -31,6 +33,11 @@ PRESET = "preset"  # `pretrained.preset`: of the method that is started from
 def make_method(plugins: PluginManager, resolved: ResolvedConfig) -> Method:
     """Return the configured method."""
     return plugins.methods.load(resolved.method)(plugins, resolved.config)
+
+
+def planned_stages(plugins: PluginManager, resolved: ResolvedConfig) -> list[Stage]:
+    """Return the stages of a configuration with the tasks that it adds to their plans. Raises as `add_tasks`."""
+    return add_tasks(make_method(plugins, resolved).stages(), resolved.ppl.tasks, plugins)
 
 
 def named_scenes(method: Method) -> list[str]:
@@ -68,7 +75,8 @@ def base_config(plugins: PluginManager, name: str, outer: ResolvedConfig) -> Res
         raise ConfigError(told, key=error.key) from None
     # What a preset says about the run (clamped renders, say) belongs to the base method; the rest is as outside.
     said = {key: value for key, value in cls.PRESETS[base.preset].items() if field_at(PipelineParams, key) is not None}
-    ppl = apply_overrides(outer.ppl, said, source=f"preset '{base.preset}' of '{name}'")
+    own = outer.ppl.model_copy(update={"tasks": []})  # those of [[tasks]] belong to the plan of `outer`
+    ppl = apply_overrides(own, said, source=f"preset '{base.preset}' of '{name}'")
     return replace(base, ppl=ppl, scene=outer.scene)
 
 
@@ -111,6 +119,8 @@ def checked_start(plugins: PluginManager, resolved: ResolvedConfig) -> ResolvedC
     Before anything runs: raises UserInputError for a file that is no model, ConfigError for a wrong key or value, or
     for either of them where the method starts from no trained scene.
     """
+    if resolved.ppl.tasks:
+        planned_stages(plugins, resolved)
     given = {
         **({INIT: f"'init' ({resolved.init})"} if resolved.init else {}),
         **{f"pretrained.{key}": f"'pretrained.{key}'" for key in resolved.pretrained},

@@ -198,7 +198,7 @@ def _train_stages(
     resolved, plugins = request.resolved, session.plugins
     scene, ppl = session.scene(resolved), resolved.ppl
     method = pretrained.make_method(plugins, resolved)
-    stages = list(method.stages())
+    stages = pretrained.planned_stages(plugins, resolved)
     rasterizer = session.rasterizer(resolved, [name for stage in stages for name in stage.prefer])
     options = rasterizer.decided(stages[-1].raster_options(stages[-1].iterations, scene.background))
     parts = StageParts(plugins, stages, ppl, loaded, rasterizer)

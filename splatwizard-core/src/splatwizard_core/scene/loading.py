@@ -135,7 +135,7 @@ def _recognise(path: Path, families: Families, without: tuple[str, ...] = ()) ->
 
 def _unrecognised(path: Path, families: Families, asked: list[str]) -> str:
     if path.is_file():
-        return f"{path} is a file, not a scene folder"
+        return f"{path} is a file, not a scene folder: name the folder, {path.parent}"
     if not path.is_dir():
         return f"{path}: {no_file(path)}"
     declared = [entry.declared for entry in families]

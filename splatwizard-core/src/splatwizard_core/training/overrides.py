@@ -15,11 +15,12 @@ from splatwizard_core.training.params import OptimizationParams
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
-def apply_overrides(config: ModelT, values: Mapping[str, Any], *, source: str) -> ModelT:
+def apply_overrides(config: ModelT, values: Mapping[str, Any], *, source: str, known: Collection[str] = ()) -> ModelT:
     """Return `config` with some values replaced.
 
     values  by dotted key; strings are parsed by the field's type ("true", "3e4", "[1, 2]", "none")
     source  where they come from, for the message: "--set", "preset 'quick'", a file name
+    known   keys that a message may suggest besides those of its blocks
 
     Raises ConfigError for an unknown key (with the nearest valid one) or a bad value.
     """
@@ -29,7 +30,7 @@ def apply_overrides(config: ModelT, values: Mapping[str, Any], *, source: str) -
     for key, value in values.items():
         annotation = field_at(cls, key)
         if annotation is None:
-            raise unknown_key(key, block_keys(cls), source)
+            raise unknown_key(key, [*block_keys(cls), *known], source)
         try:
             set_at(content, key, _bounded(parse_text(annotation, value) if isinstance(value, str) else value))
         except ValueError as error:

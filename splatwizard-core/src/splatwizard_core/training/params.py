@@ -1,12 +1,14 @@
 """Typed configuration: what belongs to the run, and what belongs to the method."""
 
 import dataclasses
+import difflib
 import typing
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, create_model
+from pydantic import BaseModel, ConfigDict, Field, create_model, model_validator
 
+from splatwizard_core.errors import ConfigError
 from splatwizard_core.scene.dataset import SceneOptions
 
 ParamsT = TypeVar("ParamsT", bound="Params")
@@ -85,6 +87,27 @@ class LogParams(Params):
     view: HowInt = Field(0, ge=0, le=65535, description="port where a viewer shows the training; 0: nowhere")
 
 
+class AddedTask(Params):
+    """A registered schedule task in the plan of a method: one table of `[[tasks]]`."""
+
+    name: str = Field(min_length=1, description="of the task, as `sw list-plugins` shows it")
+    steps: int | list[int] | str = Field(description="a step, a list of steps, or 'range(first, end, every)'")
+    settings: dict[str, Any] = Field({}, description="settings of the task, by its own keys")
+    stage: str = Field("", description="of the method, as `sw schedule` shows it; none: the first")
+    before_render: bool = Field(False, description="a pre task; else it runs between backward and the optimizer step")
+    priority: int = Field(0, description="lower runs earlier, equal ones after the method's own")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known_keys(cls, value: Any) -> Any:
+        for key in value if isinstance(value, dict) else ():
+            if key not in cls.model_fields:
+                near = difflib.get_close_matches(key, cls.model_fields, n=1)
+                hint = f"did you mean '{near[0]}'?" if near else f"a task has {', '.join(cls.model_fields)}"
+                raise ConfigError(f"unknown key '{key}' of [[tasks]]: {hint}", key="tasks")
+        return value
+
+
 class PipelineParams(Params):
     """Parameters of the run that no method owns (`ppl` in the paper's signature)."""
 
@@ -109,6 +132,7 @@ class PipelineParams(Params):
     profile: Annotated[Literal["none", "stages"], SameResult()] = Field(
         "none", description="stages: time each stage of a step"
     )
+    tasks: list[AddedTask] = Field([], description="registered schedule tasks that the plan has besides ([[tasks]])")
     raster: RasterParams = Field(RasterParams(), description="which rasterizers may serve")
     log: LogParams = Field(LogParams(), description="where else the training is logged")
 
@@ -152,6 +176,10 @@ class OptimizationParams(Params):
     def spelled(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return values by dotted key with today's keys in place of shorthands and of those of older releases."""
         return values
+
+    def settings_keys(self, plugins: Any) -> dict[str, str]:
+        """Map dotted keys of settings of what it names in `plugins` to their descriptions."""
+        return {}
 
     def completed(self, plugins: Any, sources: Mapping[str, str]) -> "OptimizationParams":
         """Return this with checked settings of what it names in `plugins`; sources: dotted key -> who gave a value."""

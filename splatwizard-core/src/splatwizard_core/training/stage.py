@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -80,14 +80,26 @@ class StageContext:
     trained: Callable[[str], SplatModel]
 
 
+class PlannedTask(NamedTuple):
+    """A task that a configuration puts into a plan."""
+
+    before_render: bool
+    when: When
+    task: Callable[..., Any]
+    priority: int = 0
+    name: str = ""
+
+
 class Stage:
     """One training stage of a method. Subclass, override what differs; another method can take it over whole.
 
     name        shown in plans and logs
     opt         the hyper-parameters that its tasks see as OptimizationParams; a borrowed stage brings its own
+    added       tasks that the configuration puts into the plan besides the stage's own
     """
 
     name: str = "train"
+    added: tuple[PlannedTask, ...] = ()
 
     def __init__(self, opt: OptimizationParams) -> None:
         self.opt = opt

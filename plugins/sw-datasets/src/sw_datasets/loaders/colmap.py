@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from sw_datasets.assemble import assemble_scene
 from sw_datasets.families import COLMAP
 from sw_datasets.gate import Gate
 from sw_datasets.loaders.colmap_model import ColmapCamera, ColmapImage, ColmapPoints, count_images, read_model
-from sw_datasets.picture_names import find_pictures, list_pictures, name_key, view_name
+from sw_datasets.picture_names import SUFFIXES, find_pictures, list_pictures, name_key, view_name
 from sw_datasets.rules import Rules, rules_for, unused_option_warnings
 from sw_datasets.start_points import cloud_beside, points_in_sight, read_cloud
 
@@ -35,7 +36,7 @@ MAX_SIDE = 1 << 24
 """Pixels; wider is a damaged file (text may state any integer, also one that no float can hold)."""
 
 
-ELSEWHERE = ("colmap/sparse/0", "colmap/sparse", "dense/0/sparse", "dense/sparse")
+ELSEWHERE = ("colmap/sparse/0", "colmap/sparse", "dense/0/sparse", "dense/sparse", "colmap_text", ".")
 """Folders of models that are not where COLMAP's mapper puts them."""
 
 MaskFinder = Callable[[Path, Sequence[str]], "list[Path | None]"]
@@ -46,10 +47,13 @@ class ColmapDataset:
     """COLMAP scenes: a sparse model with its pictures; pinhole cameras."""
 
     def detect(self, path: Path) -> float:
-        """0.5 with cameras and images files in sparse/0 or sparse, 0.45 with the cameras alone, else 0."""
+        """0.5 with cameras and images files in sparse/0 or sparse, 0.45 with the cameras alone, 0.3 where both lie in
+        the folder itself, else 0."""
         model = model_folder(path)
-        if model is None:
+        if model is None or (model == path and not _has(model, "images")):
             return 0.0
+        if model == path:
+            return 0.3
         return 0.5 if _has(model, "images") else 0.45
 
     def load(self, path: Path, options: SceneOptions) -> Scene:
@@ -80,7 +84,9 @@ def load_colmap(path: Path, rules: Rules, options: SceneOptions, *, masks: MaskF
     names = [view_name(name, file, where) for name, file in zip(names, files, strict=True)]
     gate = Gate(path, rules, quiet_masks=masks is not None)
     views = []
-    for image, name, file, mask in zip(images, names, files, (masks or mask_files)(root, names), strict=True):
+    found = (masks or mask_files)(root, names)
+    warnings += idle_masks(root, found) if masks is None else []
+    for image, name, file, mask in zip(images, names, files, found, strict=True):
         if image.camera_id not in model.cameras:
             raise SceneError(
                 f"{folder}: image '{name}' refers to camera {image.camera_id}, which is not in cameras",
@@ -122,7 +128,8 @@ def model_folder(path: Path) -> Path | None:
     """The folder of the model below `path`; None if there is none.
 
     sparse/0 or sparse, where COLMAP puts it; else that of sparse/1, sparse/2, ... with the most images; else
-    colmap/sparse/0 or colmap/sparse (nerfstudio), dense/0/sparse or dense/sparse (COLMAP's undistorted copy).
+    colmap/sparse/0 or colmap/sparse (nerfstudio), dense/0/sparse or dense/sparse (COLMAP's undistorted copy),
+    colmap_text (instant-ngp), or the folder itself.
     """
     usual = [path / "sparse" / "0", path / "sparse"]
     numbered = sorted(_numbered(path / "sparse"), key=count_images, reverse=True)
@@ -135,7 +142,11 @@ def model_folder(path: Path) -> Path | None:
 def picture_root(path: Path, model: Path, pictures: str) -> Path:
     """The folder in which the picture folder lies: the scene, or where a copy has its own, the copy."""
     own = model.parent if model.name == "sparse" else model.parent.parent
-    return own if own != path and (own / pictures).is_dir() and not (path / pictures).is_dir() else path
+    return (
+        own
+        if own != path and own.is_relative_to(path) and (own / pictures).is_dir() and not (path / pictures).is_dir()
+        else path
+    )
 
 
 def _numbered(sparse: Path) -> list[Path]:
@@ -150,7 +161,7 @@ def _numbered(sparse: Path) -> list[Path]:
 
 def _other_models(path: Path, chosen: Path) -> list[str]:
     """Tell of models that are not read: COLMAP makes several where it cannot join all pictures in one."""
-    others = [each for each in _numbered(chosen.parent) if each != chosen]
+    others = [each for each in _numbered(chosen.parent) if each != chosen] if chosen != path else []
     if not others:
         return []
     found = ", ".join(f"{each.relative_to(path).as_posix()} ({count_images(each)} images)" for each in others[:3])
@@ -207,16 +218,51 @@ def point_cloud(points: ColmapPoints) -> PointCloud:
 
 
 def mask_files(path: Path, names: Sequence[str]) -> list[Path | None]:
-    """The mask of each image: masks/NAME.png (COLMAP's way), masks/NAME, or masks/STEM.png; also in mask/."""
-    folder = next((path / name for name in ("masks", "mask") if (path / name).is_dir()), None)
+    """The mask of each image: masks/NAME.png (COLMAP's way), masks/NAME, or masks/STEM.png; also in mask/.
+
+    Else the one picture there of that stem, also with "_mask" or "mask_"; images whose last part no other has may lack
+    their folder there.
+    """
+    folder = _mask_folder(path)
     if folder is None:
         return [None] * len(names)
     there = {name_key(mask): folder / mask for mask in list_pictures(folder)}
+    stems: dict[str, list[Path]] = {}
+    for key, file in there.items():
+        stems.setdefault(os.path.splitext(key)[0], []).append(file)
+    keys = [name_key(name) for name in names]
+    lasts = Counter(key.rpartition("/")[2] for key in keys)
     found: list[Path | None] = []
-    for name in map(name_key, names):
-        candidates = (f"{name}.png", name, f"{os.path.splitext(name)[0]}.png")
-        found.append(next((there[mask] for mask in candidates if mask in there), None))
+    for key in keys:
+        last = key.rpartition("/")[2]
+        ways = [
+            mask for name in ([key, last] if lasts[last] == 1 else [key]) for mask in _mask_names(name, there, stems)
+        ]
+        found.append(next(iter(ways), None))
     return found
+
+
+def _mask_names(name: str, there: Mapping[str, Path], stems: Mapping[str, list[Path]]) -> Iterator[Path]:
+    """Files that may be the mask of an image, the likeliest first."""
+    stem = os.path.splitext(name)[0]
+    yield from (there[mask] for mask in (f"{name}.png", name, f"{stem}.png") if mask in there)
+    folder, _, last = stem.rpartition("/")
+    for each in (name, stem, f"{stem}_mask", f"{folder}/mask_{last}".lstrip("/")):
+        if len(files := stems.get(each, [])) == 1:
+            yield files[0]
+
+
+def _mask_folder(path: Path) -> Path | None:
+    return next((path / name for name in ("masks", "mask") if (path / name).is_dir()), None)
+
+
+def idle_masks(path: Path, found: Sequence[Path | None]) -> list[str]:
+    """Tell of pictures among the masks that are of no image."""
+    folder = _mask_folder(path)
+    if folder is None:
+        return []
+    there, used = len(list_pictures(folder)), len({mask for mask in found if mask is not None})
+    return [f"{there - used} of {there} pictures in {folder.name} are the mask of no image"] if there > used else []
 
 
 def _has(folder: Path, part: str) -> bool:
@@ -226,10 +272,17 @@ def _has(folder: Path, part: str) -> bool:
 def _existing(path: Path, picture_folder: str) -> Path:
     folder = path / picture_folder
     if not folder.is_dir():
-        there = sorted(p.name for p in path.iterdir() if p.is_dir() and p.name.startswith("images"))
-        hint = f"there is {', '.join(there)} (--images {there[0]})" if there else "no folder is called images*"
+        there = sorted((p for p in path.iterdir() if p.is_dir() and _has_pictures(p)),
+                       key=lambda p: (not p.name.lower().startswith("images"), p.name))  # fmt: skip
+        names = ", ".join(p.name for p in there[:4])
+        hint = f"there is {names} (--images {there[0].name})" if there else "no folder beside it holds pictures"
         raise SceneError(f"{path}: the picture folder '{picture_folder}' is missing; {hint}", path=str(path))
     return folder
+
+
+def _has_pictures(folder: Path) -> bool:
+    with os.scandir(folder) as entries:
+        return any(os.path.splitext(each.name)[1].lower() in SUFFIXES for each in entries)
 
 
 def _unused(folder: Path, registered: int) -> list[str]:

@@ -23,9 +23,10 @@ from splatwizard_native import json_reason
 from sw_datasets.assemble import assemble_scene
 from sw_datasets.families import TRANSFORMS
 from sw_datasets.gate import Gate
-from sw_datasets.loaders.colmap import mask_files
+from sw_datasets.loaders.colmap import idle_masks, mask_files
 from sw_datasets.name_lists import NameLists
 from sw_datasets.picture_names import SUFFIXES, find_each, find_pictures, is_inside, view_name
+from sw_datasets.pictures import read_header
 from sw_datasets.rules import rules_for, unused_option_warnings
 from sw_datasets.start_points import cloud_beside, points_in_sight, read_cloud
 
@@ -135,11 +136,13 @@ def read_frames(path: Path, file: str, gate: Gate) -> Frames:
     files = find_pictures(path, names, found.warnings)
     names = [view_name(name, picture, path) for name, picture in zip(names, files, strict=True)]
     masks = _masks(path, frames, names, found.warnings)
+    if dynamic := sum((each.parent / f"dynamic_mask_{each.stem}.png").is_file() for each in files):
+        found.warnings.append(f"{dynamic} masks dynamic_mask_*.png (instant-ngp) are not used")
     contradicted: list[str] = []
     for frame, name, picture_file, mask in zip(frames, names, files, masks, strict=True):
         merged = ChainMap(frame, data)
         _check_lens(merged, name, where)
-        size = _size(merged, name, where)
+        size = _size(merged, name, where, picture_file)
         picture = gate.admit(name, picture_file, size)
         fx, fy, cx, cy = _intrinsics(merged, name, where, (picture.width, picture.height), size, contradicted)
         R, tau = _pose(frame.get("transform_matrix"), name, where)
@@ -195,6 +198,7 @@ def _masks(path: Path, frames: list[Any], names: list[str], warnings: list[str])
     found = find_each(path, list(told.values()))
     for i, mask in zip(told, found, strict=True):
         masks[i] = mask or masks[i]
+    warnings += idle_masks(path, masks)
     if missing := found.count(None):
         warnings.append(f"{missing} masks that 'mask_path' names are not there")
     return masks
@@ -241,11 +245,18 @@ def _number(value: Any, key: str, name: str, where: str) -> float:
         return math.inf
 
 
-def _size(values: Mapping[str, Any], name: str, where: str) -> tuple[int, int] | None:
-    """(w, h) that the intrinsics were made for; None where the file does not say."""
+def _size(values: Mapping[str, Any], name: str, where: str, picture: Path) -> tuple[int, int] | None:
+    """(w, h) that the intrinsics were made for; None where the file does not say.
+
+    Of one side alone the other follows from the picture's aspect.
+    """
     told = [_number(values[key], key, name, where) for key in ("w", "h") if values.get(key) is not None]
-    if len(told) < 2:
+    if not told:
         return None
+    if len(told) == 1:
+        header = read_header(picture)
+        aspect = header.height / header.width
+        told = [told[0], told[0] * aspect] if values.get("w") is not None else [told[0] / aspect, told[0]]
     if not all(1 <= side < 1 << 24 for side in told):
         raise SceneError(f"{where}: w and h of image '{name}' are {told[0]:g} and {told[1]:g} px")
     return round(told[0]), round(told[1])
@@ -283,6 +294,8 @@ def _intrinsics(
     fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
     assert fx is not None
     assert fy is not None
+    if not (fx > 0 and fy > 0):
+        raise SceneError(f"{where}: the focal lengths of image '{name}' are {fx:g} and {fy:g} px: they make no sense")
     sx, sy = width / w, height / h
     return fx * sx, fy * sy, told.get("cx", w / 2) * sx, told.get("cy", h / 2) * sy
 
@@ -301,6 +314,11 @@ def _pose(matrix: Any, name: str, where: str) -> tuple[torch.Tensor, torch.Tenso
         raise SceneError(f"{where}: 'transform_matrix' of image '{name}' is not a 4x4 matrix")
     if not np.isfinite(c2w).all():
         raise SceneError(f"{where}: the pose of image '{name}' is not finite (NaN or infinite)")
+    if c2w.shape == (4, 4) and np.abs(c2w[3] - (0, 0, 0, 1)).max() > 1e-6:
+        row = ", ".join(f"{value:g}" for value in c2w[3])
+        raise SceneError(
+            f"{where}: the last row of 'transform_matrix' of image '{name}' is {row}, not 0, 0, 0, 1: is it transposed?"
+        )
     R = (c2w[:3, :3] * np.array([1.0, -1.0, -1.0])).T  # OpenGL looks along -z with y up; ours +z, y down
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
         raise SceneError(f"{where}: 'transform_matrix' of image '{name}' is not a rotation and a translation")

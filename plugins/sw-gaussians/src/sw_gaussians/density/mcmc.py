@@ -1,6 +1,7 @@
-"""Densification as Markov chain Monte Carlo: dead Gaussians move to live ones, a few more join them, all are shaken.
+"""Density control as Markov chain Monte Carlo: dead Gaussians move to live ones, a few more join them, all are shaken.
 
-Functions on a model and the optimizer that edits its rows; `mcmc_tasks` makes schedule tasks of them.
+Every draw comes from a stream that is named after the step, so there is no state to save: a run that resumes at a step
+draws what the uninterrupted one drew there.
 Source: 3D Gaussian Splatting as Markov Chain Monte Carlo (arXiv 2404.09591).
 """
 
@@ -8,17 +9,107 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
-from splatwizard_core.api import GaussianModel, SplatOptimizer
-from sw_gaussians.density import rotate
+from splatwizard_core.api import ConfigError, DensityControl, GaussianModel, LossPack, Params, SplatOptimizer, stream
+from sw_gaussians.density.splitting import rotate
+
+if TYPE_CHECKING:
+    from splatwizard_core.api import RenderResult, StageContext, TrainingState
+    from splatwizard_core.training.density import DensityReport, DensityTask
 
 MAX_COPIES = 51
 """More copies of one Gaussian than this are treated as this many (the paper's code has binomials up to there)."""
 STEEPNESS = 100.0
-"""Of the logistic that turns the noise off as a Gaussian becomes opaque."""
+"""Steepness of the logistic that turns the noise off as a Gaussian becomes opaque."""
+
+
+class MCMCSettings(Params):
+    """Settings of density control by MCMC. Defaults are those of the paper's code."""
+
+    cap: int = Field(1_000_000, ge=1, description="most Gaussians that growth makes")
+    start: int = Field(600, ge=0, description="first step that relocates and grows")
+    stop: int = Field(25_000, ge=0, description="no relocation or growth from this step on")
+    interval: int = Field(100, ge=1, description="steps between relocations")
+    growth: float = Field(0.05, ge=0, description="share of Gaussians that are added each time")
+    min_opacity: float = Field(0.005, gt=0, lt=1, description="Gaussians up to this opacity are dead: relocated")
+    noise: float = Field(5e5, ge=0, description="strength of the noise on the means, times their step size")
+    opacity_weight: float = Field(0.01, ge=0, description="weight of the mean opacity in the loss")
+    scale_weight: float = Field(0.01, ge=0, description="weight of the mean scale in the loss, world units")
+    init_opacity: float = Field(0.5, gt=0, lt=1, description="opacity at the start")
+    init_scale: float = Field(0.1, gt=0, description="scales at the start, times the distance to the neighbours")
+
+
+class MCMC(DensityControl):
+    """Relocation and growth every 100 steps; noise at each step; opacities and scales are part of the loss."""
+
+    Settings = MCMCSettings
+    regularises = True
+
+    @property
+    def rounds(self) -> range:
+        return range(self.settings.start, self.settings.stop, self.settings.interval)
+
+    @property
+    def until(self) -> int:
+        return int(self.settings.stop)
+
+    def start_values(self) -> dict[str, float]:
+        return {"opacity": self.settings.init_opacity, "scale_factor": self.settings.init_scale}
+
+    def begin(self, state: StageContext) -> None:
+        if not isinstance(state.model, GaussianModel) or state.model.NUM_SCALES != GaussianModel.NUM_SCALES:
+            raise ConfigError(
+                "density=mcmc relocates Gaussians with three scales, which surfels do not have: set another one",
+                key="density.name",
+            )
+
+    def pre_tasks(self) -> Iterable[DensityTask]:
+        # It belongs to the update of the step before, and to that step's learning rate.
+        return [("add noise", None, self.shake)] if self.settings.noise > 0 else []
+
+    def post_tasks(self) -> Iterable[DensityTask]:
+        return ("relocate", self.rounds, self.adjust), ("grow", self.rounds, self.add)
+
+    def shake(self, state: TrainingState) -> None:
+        """Add noise to the means."""
+        model = gaussians_of(state)
+        if state.step > 1:  # before step 1 there was no update
+            draws = stream(model.split_seed, f"noise/{state.step}", model.means.device)
+            lr, settings = state.optimizer.lr("means"), self.settings
+            add_noise(model, draws, lr=lr, strength=settings.noise, min_opacity=settings.min_opacity)
+
+    def adjust(self, state: TrainingState) -> DensityReport:
+        model = gaussians_of(state)
+        draws = stream(model.split_seed, f"relocate/{state.step}")
+        return {"relocated": relocate(model, state.optimizer, draws, min_opacity=self.settings.min_opacity)}
+
+    def add(self, state: TrainingState) -> DensityReport:
+        """Add Gaussians, up to the cap."""
+        model, settings = gaussians_of(state), self.settings
+        draws, least = stream(model.split_seed, f"grow/{state.step}"), settings.min_opacity
+        added = grow(model, state.optimizer, draws, cap=settings.cap, growth=settings.growth, min_opacity=least)
+        return {"added": added}
+
+    def regularised(self, loss: LossPack, result: RenderResult, step: int) -> LossPack:
+        """Add what makes Gaussians fade and shrink unless a picture needs them, so that they can be relocated."""
+        settings, inputs = self.settings, result.inputs
+        if inputs.scales is None:
+            raise TypeError("density=mcmc needs a model with scales: that of 3dgs has them")
+        parts = {"opacity": inputs.opacities.mean(), "scale": inputs.scales.mean()}
+        total = loss.total + settings.opacity_weight * parts["opacity"] + settings.scale_weight * parts["scale"]
+        return LossPack(total, loss.parts | {name: part.detach() for name, part in parts.items()})
+
+
+def gaussians_of(state: TrainingState) -> GaussianModel:
+    """Return the model, which `begin` has let pass."""
+    assert isinstance(state.model, GaussianModel)
+    return state.model
 
 
 @functools.cache

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from splatwizard_core.api import GaussianModel, RenderResult
-from sw_gaussians.native import GAUSSIANS
+from splatwizard_core.api import GaussianModel, RenderResult, SplatModel
+from sw_gaussians.fast import statistics as fast
 
 BUFFER = "fragments"
 """Buffer [N,3] of a model: sum of g, sum of g^2, number of fragments, with g = o dL/do of one pixel of one view."""
@@ -21,8 +21,8 @@ def add_buffer(model: GaussianModel) -> None:
         model.ROWS = (*model.ROWS, BUFFER)
 
 
-def drop_buffer(model: GaussianModel) -> None:
-    """Take the buffer from a model again; nothing happens to one without it."""
+def drop_buffer(model: SplatModel) -> None:
+    """Remove the buffer from the model if it has one."""
     if BUFFER in model.ROWS:
         model.ROWS = tuple(name for name in model.ROWS if name != BUFFER)
         delattr(model, BUFFER)
@@ -52,7 +52,7 @@ def collect_opacity_gradients(model: GaussianModel, result: RenderResult) -> Non
     if result.fragment_grad is None or BUFFER not in model.ROWS:
         raise ValueError(
             "opacity gradients need a stage that renders them, with RasterOptions(fragment_grad=True), and a model "
-            "with the buffer of sw_gaussians.fragments.add_buffer (of 3DGS: with fast.densify=budget)"
+            "with the buffer of sw_gaussians.density.fragments.add_buffer (of 3DGS: with density=budget)"
         )
     logits = model.opacity_logits
     if logits.grad is not None:
@@ -60,15 +60,13 @@ def collect_opacity_gradients(model: GaussianModel, result: RenderResult) -> Non
 
 
 def accumulate_fragments(sums: Tensor, gradients: Tensor, logits: Tensor, fragments: Tensor) -> None:
-    """Add one view to `BUFFER`, in place; on CUDA in one launch, with the same sums.
+    """Add one view to `BUFFER`, in place.
 
     sums        [N,3] the buffer
     gradients   [N] derivative of the loss by the logits [N] of the opacities
     fragments   [N,2] sum of g^2, and number of fragments (RenderResult.fragment_grad)
     """
-    by_kernel = sums.is_cuda and GAUSSIANS.has_cuda()
-    ops = torch.ops.splatwizard_gaussians
-    if not (by_kernel and ops.fragment_statistics(gradients, logits, fragments, sums, LEAST_CLEAR)):
+    if not fast.accumulate_fragments(sums, gradients, logits, fragments, least_clear=LEAST_CLEAR):
         accumulate_fragments_in_torch(sums, gradients, logits, fragments)
 
 

@@ -1,15 +1,13 @@
-"""Evidence of several views about each Gaussian: in how many badly drawn pixels it takes part.
+"""Blame of Gaussians: how much each takes part in the badly drawn pixels of several views.
 
-One view can ask for a Gaussian that others have no use for; what several draw badly needs one. `densify_to_budget`
-takes the first score as a veto, `fast_tasks.PruneByViews` the second.
-Source: FastGS (arXiv 2511.04283), multi-view consistent densification and pruning.
+One view can blame a Gaussian that others have a use for; what several blame is not needed (`fast_tasks.PruneByViews`).
+Source: FastGS (arXiv 2511.04283), multi-view consistent pruning.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -30,39 +28,22 @@ OUTLIERS = 0.001
 """Share of the Gaussians that may have more blame than counts as all of it."""
 
 
-@dataclass(frozen=True)
-class ViewEvidence:
-    """Sums over views of how many badly drawn pixels each Gaussian was blended into.
+def guilt(blame: Tensor) -> Tensor:
+    """Return the blame [N] as a share, 0..1, of that which a thousandth of the Gaussians exceeds.
 
-    counts  [N] int64
-    blame   [N] float32, each view's pixels times its photometric loss
-    views   how many views there were
+    Of the largest, as in the paper, where fewer than a thousandth have more than the least; elsewhere one outlier
+    would decide it. Blame that is not finite counts as none.
     """
-
-    counts: Tensor
-    blame: Tensor
-    views: int
-
-    def wanted(self, least: float) -> Tensor:
-        """Return which Gaussians [N] bool are in more than `least` badly drawn pixels a view, rounded down."""
-        return torch.div(self.counts, self.views, rounding_mode="floor") > least
-
-    def guilt(self) -> Tensor:
-        """Return the blame [N] as a share, 0..1, of that which a thousandth of the Gaussians exceeds.
-
-        Of the largest, as in the paper, where fewer than a thousandth have more than the least; elsewhere one outlier
-        would decide it. Blame that is not finite counts as none.
-        """
-        blame = self.blame.nan_to_num(0.0, 0.0, 0.0)
-        low, most = blame.aminmax()
-        # Not torch.kthvalue, which a GPU refuses where algorithms must be deterministic.
-        high = blame.sort().values[math.ceil((1 - OUTLIERS) * len(blame)) - 1]
-        high = torch.where(high > low, high, most)
-        return ((blame - low) / (high - low).clamp_min(1e-30)).clamp_(0, 1)
+    blame = blame.nan_to_num(0.0, 0.0, 0.0)
+    low, most = blame.aminmax()
+    # Not torch.kthvalue, which a GPU refuses where algorithms must be deterministic.
+    high = blame.sort().values[math.ceil((1 - OUTLIERS) * len(blame)) - 1]
+    high = torch.where(high > low, high, most)
+    return ((blame - low) / (high - low).clamp_min(1e-30)).clamp_(0, 1)
 
 
 @torch.no_grad()
-def view_evidence(
+def blame_of_views(
     model: SplatModel,
     views: Sequence[View],
     rasterizer: Rasterizer,
@@ -72,8 +53,8 @@ def view_evidence(
     clamp: bool = False,
     lambda_dssim: float = 0.2,
     padding: Literal["same", "valid"] = "same",
-) -> ViewEvidence:
-    """Draw the views, find their badly drawn pixels, and count those of each Gaussian.
+) -> Tensor:
+    """Return the blame [N] float32: for each view the badly drawn pixels of a Gaussian, times the view's loss.
 
     background  [3] of the training, 0..1
     threshold   a pixel is badly drawn where its absolute error, the mean over channels, brought to 0..1 by the view's
@@ -85,9 +66,8 @@ def view_evidence(
     gradient. Raises ValueError without views, CapabilityError of a rasterizer that does not count.
     """
     if not views:
-        raise ValueError("evidence of several views needs at least one")
+        raise ValueError("the blame of several views needs at least one")
     device = background.device
-    counts = torch.zeros(model.num_rows, dtype=torch.int64, device=device)
     blame = torch.zeros(model.num_rows, device=device)
     for view in views:
         camera = view.camera.to(device)
@@ -96,11 +76,9 @@ def view_evidence(
         image = image.clamp(0, 1) if clamp else image
         truth = view.image(background, device)
         hits = ScoreSpec("hits", "hits", pixel_weight=badly_drawn(image, truth, threshold))
-        found = rasterizer.render(inputs, camera, RasterOptions(background=background, scores=(hits,)))
-        drawn = found.scores["hits"]
-        counts += drawn
+        drawn = rasterizer.render(inputs, camera, RasterOptions(background=background, scores=(hits,))).scores["hits"]
         blame += photometric_loss(image, truth, lambda_dssim=lambda_dssim, padding=padding).total * drawn
-    return ViewEvidence(counts, blame, len(views))
+    return blame
 
 
 def badly_drawn(image: Tensor, truth: Tensor, threshold: float) -> Tensor:

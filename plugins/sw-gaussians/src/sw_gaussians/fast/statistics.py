@@ -1,0 +1,38 @@
+"""Statistics of a view in one launch on CUDA: the same sums, to the last bit of a root."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from splatwizard_core.api import GaussianModel
+from sw_gaussians.native import GAUSSIANS
+
+
+def accumulate(model: GaussianModel, gradients: Tensor, radii: Tensor) -> bool:
+    """Do what `statistics.accumulate_in_torch` does, where the kernel can; return whether it could."""
+    sums = model.grad_accum, model.denom, model.max_radii2d
+    fits = _fits_kernel(gradients, radii, sums) and GAUSSIANS.has_cuda()
+    if fits:
+        torch.ops.splatwizard_gaussians.view_statistics(gradients, radii, *sums)
+    return fits
+
+
+def accumulate_fragments(
+    sums: Tensor, gradients: Tensor, logits: Tensor, fragments: Tensor, *, least_clear: float
+) -> bool:
+    """Do what `density.fragments.accumulate_fragments_in_torch` does, where the kernel can; return whether it could."""
+    if not (sums.is_cuda and GAUSSIANS.has_cuda()):
+        return False
+    fragment_statistics = torch.ops.splatwizard_gaussians.fragment_statistics
+    return bool(fragment_statistics(gradients, logits, fragments, sums, least_clear))
+
+
+def _fits_kernel(gradients: Tensor, radii: Tensor, sums: tuple[Tensor, ...]) -> bool:
+    return (
+        gradients.is_cuda
+        and radii.dtype == torch.int32
+        and radii.is_contiguous()
+        and gradients.data_ptr() % 8 == 0
+        and all(t.dtype == torch.float32 and t.is_contiguous() for t in (gradients, *sums))
+    )

@@ -1,0 +1,110 @@
+"""Keys of configurations until 0.2, when all density controls stood in one: as they are read today."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from splatwizard_core.api import ConfigError
+from sw_gaussians.choices import Moved
+from sw_gaussians.density.choice import DensityChoice
+
+_SHARED = (
+    "start", "stop", "interval", "grad_threshold", "percent_dense", "min_opacity", "reset_interval", "reset_opacity",
+    "white_reset",
+)  # fmt: skip
+_ADAPTIVE = ("world_prune", "prune_screen_px", "absgrad", "revised_opacity")
+_MCMC = (
+    "cap", "start", "stop", "interval", "growth", "min_opacity", "noise", "opacity_weight", "scale_weight",
+    "init_opacity", "init_scale",
+)  # fmt: skip
+_BUDGET = ("score", "cap", "growth", "opacity", "morton")
+
+
+def _settings(block: str, names: tuple[str, ...], *providers: str) -> dict[str, Moved]:
+    return {f"{block}.{name}": Moved((f"density.settings.{name}",), None, providers) for name in names}
+
+
+DENSIFY: Mapping[str, Moved] = {
+    **_settings("densify", _SHARED, "adc", "budget"),
+    **_settings("densify", _ADAPTIVE, "adc"),
+    "densify.pause_after_reset": Moved((), 0),
+}
+"""Keys of the block `densify`, which others than 3DGS had, too."""
+
+OLDER: Mapping[str, Moved] = {
+    **DENSIFY,
+    **_settings("mcmc", _MCMC, "mcmc"),
+    **_settings("fast", _BUDGET, "budget"),
+    "fast.resolution": Moved(("pictures.schedule",)),
+    "fast.resolution_start": Moved(("pictures.start",)),
+    "fast.resolution_rounding": Moved(("pictures.rounding",)),
+    "fast.resolution_hold": Moved((), False),
+    "fast.sh_every": Moved((), 1),
+    "fast.settle": Moved((), 1.0),
+    "fast.veto_views": Moved((), 0),
+    "fast.veto_pixels": Moved((), 5.0),
+    "fast.late_prune": Moved((), False),
+}
+
+
+def translated(values: dict[str, Any], density: DensityChoice) -> dict[str, Any]:
+    """Return values by dotted key with the name of the control that older keys mean.
+
+    density     as it stands without these values
+
+    Raises ConfigError for what no control does any more.
+    """
+    chain, way = values.pop("mcmc.enabled", None), values.pop("fast.densify", None)
+    sparse = values.get("sparse_adam")
+    if sparse == "per_row":
+        raise ConfigError(
+            "sparse_adam=per_row is gone since 0.3: sparse_adam=true updates without bias correction, as published",
+            key="sparse_adam",
+        )
+    if sparse in ("off", "none"):
+        values["sparse_adam"] = sparse == "none"
+    if chain is not None or way is not None:
+        now = density.name
+        if str(chain).lower() in ("true", "1", "yes", "on"):
+            name = "mcmc"
+        elif way is None:
+            name = "adc" if now == "mcmc" else now
+        else:
+            name = "budget" if way == "budget" else "adc"
+        values.setdefault("density.name", name)
+        if {name, now} == {"adc", "budget"}:  # both had these keys in common
+            kept = {key: density.settings[key] for key in _SHARED if key in density.settings}
+            values = {**{f"density.settings.{key}": value for key, value in kept.items()}, **values}
+    if values.get("fast.opacity") == "halve" and values.get("density.name", density.name) == "adc":
+        raise ConfigError(
+            "fast.opacity=halve is a setting of density=budget since 0.3: leave it out, or set density=budget",
+            key="fast.opacity",
+        )
+    return values
+
+
+def within(values: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+    """Return values by dotted key with today's keys of `densify` in a block of another method's values.
+
+    prefix  of the block, such as "base."; a table that stands there whole is flattened
+    """
+    found: dict[str, Any] = {}
+    for key, value in values.items():
+        if f"{key}." == prefix and isinstance(value, Mapping):
+            found |= _flat(value, prefix)
+        else:
+            found[key] = value
+    return {_today(key, prefix): value for key, value in found.items()}
+
+
+def _flat(table: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, value in table.items():
+        found |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value}
+    return found
+
+
+def _today(key: str, prefix: str) -> str:
+    moved = DENSIFY.get(key.removeprefix(prefix)) if key.startswith(prefix) else None
+    return f"{prefix}{moved.keys[0]}" if moved is not None and moved.keys else key

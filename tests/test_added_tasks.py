@@ -1,0 +1,43 @@
+"""Every schedule task of ours can be put into a plan by `[[tasks]]`."""
+
+import pytest
+from small_scene import context_of, small_scene, ten_gaussians
+from sw_gaussians.late_batches import BatchingOptimizer
+
+from splatwizard_core.errors import TaskSignatureError
+from splatwizard_core.plugins import load_plugins
+from splatwizard_core.plugins.catalogue import is_ours
+from splatwizard_core.training.added_tasks import add_tasks
+from splatwizard_core.training.optimizer import ParamGroup
+from splatwizard_core.training.params import AddedTask, OptimizationParams, PipelineParams
+from splatwizard_core.training.scheduler import build_schedulers
+from splatwizard_core.training.stage import Stage
+
+NEEDED = {
+    "average-parameters": {"first": 10, "last": 30},
+    "settle-learning-rates": {"rates": {"means": 1e-3}, "first": 10, "last": 20},
+}
+"""Settings without a default."""
+TASKS = [entry.name for entry in load_plugins().tasks if is_ours(entry.distribution)]
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_it_is_in_the_plan_of_a_stage_that_knows_nothing_of_it(name):
+    asked = AddedTask(name=name, steps="range(10, 40, 10)", settings=NEEDED.get(name, {}))
+    (stage,) = add_tasks([Stage(OptimizationParams(iterations=100))], [asked], load_plugins())
+    pre, post = build_schedulers(stage, PipelineParams())
+    assert post.plan_lines() == [f"post | {name} | range(10, 40, 10) | priority 0"]
+    assert pre.plan_lines() == []
+    scene = small_scene()
+    model = ten_gaussians(scene)
+    context = context_of(model, scene)
+    context.optimizer = BatchingOptimizer(model, [ParamGroup("means", 0.1)])
+    if name == "mask-prune":
+        with pytest.raises(TaskSignatureError, match="wants VolumeMaskedGaussians, this run has GaussianModel"):
+            post.check(context)
+    else:
+        post.check(context)  # everything that it asks for is there
+
+
+def test_there_are_some():
+    assert len(TASKS) >= 10
