@@ -13,7 +13,7 @@ from splatwizard_core.runs.pretrained import make_method
 from splatwizard_core.streams import stream
 
 PLUGINS = load_plugins()
-ANCHORS = {
+SMALL = {
     "iterations": 9, "voxel_size": 0.02, "feature_dim": 8, "num_offsets": 5, "hidden": 16, "growth.start": 2,
     "growth.start_stat": 0, "growth.stop": 5, "growth.interval": 1, "growth.success": 1.0, "rate_term.sample": 0.5,
 }  # fmt: skip
@@ -22,10 +22,10 @@ GRID = {
     "grid.log2_planes": 9, "phases.quantized": 3, "phases.rebound": 4, "phases.entropy": 5,
 }  # fmt: skip
 PLANS = {
-    "hac": {**ANCHORS, **GRID},
-    "hac-plus": {**ANCHORS, **GRID, "channel.slices": [3, 5], "channel.hidden": 6},
+    "hac": {**SMALL, **GRID},
+    "hac-plus": {**SMALL, **GRID, "channel.slices": [3, 5], "channel.hidden": 6},
     "cat-3dgs": {
-        **ANCHORS, "context.channels": 4, "context.hidden": 16, "context.slices": [3, 5], "context.slice_hidden": 8,
+        **SMALL, "context.channels": 4, "context.hidden": 16, "context.slices": [3, 5], "context.slice_hidden": 8,
         "phases.quantize": 2, "phases.triplane": 3, "phases.warmup": 6, "phases.scene": 7, "phases.planes": 8,
     },
 }  # fmt: skip
