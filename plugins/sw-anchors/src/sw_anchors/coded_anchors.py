@@ -157,15 +157,15 @@ class CodedAnchors(AnchorModel):
 
     @property
     def rate_model(self) -> RateModel:
-        """What predicts steps and distributions, in training and for the file."""
+        """Return the rate model: it predicts steps and distributions, in training and for the file."""
         raise NotImplementedError
 
     def context_rows(self) -> Context:
-        """What the rate model predicts from, for all anchors."""
+        """Return the tensors that the rate model predicts from, a row per anchor of the model."""
         raise NotImplementedError
 
     def context_of(self, rows: Tensor) -> Context:
-        """The same of the anchors `rows`."""
+        """Return these tensors for the anchors `rows`."""
         return tuple(part.index_select(0, rows) for part in self.context_rows())
 
     @property

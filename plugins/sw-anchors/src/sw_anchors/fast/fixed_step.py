@@ -31,7 +31,7 @@ PARAMETERS = ("features", "log_scales", "offsets", "mask_logits")
 
 
 class Model(Protocol):
-    """What the decoding asks of a `CodedAnchors`."""
+    """Members of a `CodedAnchors` that its decoding reads."""
 
     phase: str
     sample: float
@@ -47,7 +47,7 @@ class Model(Protocol):
 
     @property
     def rate_model(self) -> RateModel:
-        """What predicts."""
+        """The rate model."""
         ...
 
     @property

@@ -16,7 +16,7 @@ from sw_hac_plus.fast.channel_networks import ChannelNetworks
 
 
 class Model(predicted_bits.Model, Protocol):
-    """What is asked of a rate model."""
+    """Members of a rate model that are read here."""
 
     @property
     def channel(self) -> ChannelMixture | None:

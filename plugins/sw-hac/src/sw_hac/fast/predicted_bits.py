@@ -78,7 +78,7 @@ class Predicted:
 
 
 class Model(Protocol):
-    """What is asked of a rate model."""
+    """Members of a rate model that are read here."""
 
     @property
     def base_steps(self) -> tuple[float, float, float]:

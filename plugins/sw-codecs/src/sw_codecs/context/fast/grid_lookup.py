@@ -23,7 +23,7 @@ MAX_FEATURES = 8
 
 
 class Grid(Protocol):
-    """What is asked of a HashGrid."""
+    """Members of a HashGrid that its lookup reads."""
 
     binary: bool
     features: int
