@@ -9,6 +9,7 @@ import torch
 from splatwizard_core.errors import ShapeError
 from sw_codecs.codebooks import batches
 from sw_codecs.codebooks import nearest as search
+from sw_codecs.codebooks.fast import boxes as search_boxes
 from sw_codecs.codebooks.kmeans import kmeans
 from sw_codecs.codebooks.nearest import nearest
 from sw_codecs.codebooks.relocation import relocate
@@ -53,9 +54,9 @@ def boxes(monkeypatch):
     if CODECS.available() is not None:
         pytest.skip(str(CODECS.available()))
     CODECS.load()
-    monkeypatch.setattr(search, "WORTH_BOXES", 0)
-    monkeypatch.setattr(search, "SHARE", 1.0)
-    monkeypatch.setattr(search, "_by_products", None)  # not what is to be seen
+    monkeypatch.setattr(search_boxes, "WORTH_BOXES", 0)
+    monkeypatch.setattr(search_boxes, "SHARE", 1.0)
+    monkeypatch.setattr(search, "search_by_products", None)  # not what is to be seen
 
 
 @pytest.mark.parametrize("width", [1, 3, 8, 9, 30])  # boxes have 8 axes
@@ -87,7 +88,7 @@ def test_of_rows_along_few_axes_few_distances_are_computed(boxes):
 
 def test_where_boxes_leave_out_little_products_are_made(boxes, monkeypatch):
     x, entries = (torch.randn(n, 40, generator=gen(n)) for n in (300, 200))
-    monkeypatch.setattr(search, "SHARE", 0.5)
+    monkeypatch.setattr(search_boxes, "SHARE", 0.5)
     with pytest.raises(TypeError):  # the fixture took the search by products away
         nearest(x, entries)
 
@@ -401,3 +402,12 @@ def test_cuda_codebooks_are_as_good():
     # The devices draw other rows from one seed; of ten seeds on a CPU either error differs by less than 1 %.
     assert found[2] == pytest.approx(found[0], rel=0.05)
     assert found[3] == pytest.approx(found[1], rel=0.05)
+
+
+def test_the_environment_can_do_without_boxes(monkeypatch):
+    x, entries = (torch.randn(n, 3, generator=gen(n)) for n in (3000, 1500))
+    monkeypatch.setenv("SW_FAST", "0")
+    assert not search_boxes.fits(x, entries)
+    plain = nearest(x, entries)
+    monkeypatch.setenv("SW_FAST", "1")
+    assert torch.equal(nearest(x, entries)[0], plain[0])

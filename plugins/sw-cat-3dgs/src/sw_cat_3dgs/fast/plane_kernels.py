@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from sw_codecs.context.ordered_sums import largest_for_sums
+from sw_codecs.context.fast.ordered_sums import largest_for_sums
 from sw_codecs.native import CODECS
 
 MOST_SIZES = 4

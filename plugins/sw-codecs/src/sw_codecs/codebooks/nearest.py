@@ -1,9 +1,4 @@
-"""Nearest codebook entries of many rows, a tile at a time: by boxes about groups of entries, or by matrix products.
-
-On a CPU a native kernel leaves out the groups whose box is farther than an entry that was found. Where the entries have
-few axes or vary along few (shapes, trained colours), that is nearly all of them; where a sample of the rows shows that
-it is not, and on a GPU, all distances of a tile are one matrix product.
-"""
+"""Nearest codebook entries of many rows, a tile at a time: all distances of a tile are one matrix product."""
 
 from __future__ import annotations
 
@@ -12,13 +7,10 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from sw_codecs.native import CODECS
+from sw_codecs.codebooks.fast import boxes
 
 GROUP = 64  # entries whose least score is found first: a minimum is vectorised on a CPU, its place is not
 TILE = {"cpu": 1 << 24, "cuda": 1 << 27}  # scores at a time: 64 MB fit a cache's reach, 512 MB fill a GPU
-WORTH_BOXES = 1 << 22  # distances: some 10 ms of matrix products
-SAMPLE = 512  # rows that tell whether boxes leave out enough
-SHARE = 0.5  # of the distances; each that is computed costs about as much as one of a matrix product
 
 Search = Callable[[Tensor, int], Tensor]
 """(tile [n, d] of rows, number of its first row) -> index [n] int64 of the nearest entry of each."""
@@ -41,12 +33,12 @@ def nearest(x: Tensor, entries: Tensor, *, block: int | None = None, others: boo
     Two entries that are nearer to each other than about 1e-3 of the size of the whole codebook may be taken for one
     another in float32. Not differentiable.
     """
-    search = None if others else _by_boxes(x, entries)
+    search = None if others or not boxes.fits(x, entries) else boxes.search_by_boxes(x, entries)
     # Boxes are made for each tile, in the time that some 1,500 rows take; they need no scores.
     rows_at_once = block_rows(len(entries) if search is None else 1, x.device, block)
     rows_at_once = min(rows_at_once, max(len(x), 1))
     if search is None:
-        search = _by_products(entries, rows_at_once, others=others)
+        search = search_by_products(entries, rows_at_once, others=others)
     index = torch.empty(len(x), dtype=torch.int64, device=x.device)
     distance = torch.empty(len(x), dtype=x.dtype, device=x.device)
     for start in range(0, len(x), rows_at_once):
@@ -57,7 +49,7 @@ def nearest(x: Tensor, entries: Tensor, *, block: int | None = None, others: boo
     return index, distance
 
 
-def _by_products(entries: Tensor, rows_at_once: int, *, others: bool) -> Search:
+def search_by_products(entries: Tensor, rows_at_once: int, *, others: bool) -> Search:
     """Return the search by matrix products.
 
     |x|^2 changes no order, so the score is |c|^2 - 2 x.c, about the mean of the entries: far from the origin the
@@ -90,26 +82,3 @@ def _least_by_groups(scores: Tensor) -> Tensor:
     groups = scores.view(len(scores), -1, GROUP)
     best = groups.amin(2).argmin(1)
     return best * GROUP + groups[torch.arange(len(scores)), best].argmin(1)
-
-
-def _by_boxes(x: Tensor, entries: Tensor) -> Search | None:
-    """Return the search of the native kernel; None where it is not at hand, or boxes leave out too little for x."""
-    fits = x.device.type == "cpu" and x.dtype == entries.dtype == torch.float32 and entries.shape[1] > 0
-    if not fits or len(x) * len(entries) < WORTH_BOXES or not CODECS.try_load():
-        return None
-    centre = entries.mean(0)
-    centred = entries - centre
-    # Along the axes of the entries' variance, the largest first, boxes about the first few leave out most.
-    squares = centred.double().T @ centred.double()
-    if not bool(torch.isfinite(squares).all()):
-        return None
-    axes = torch.linalg.eigh(squares).eigenvectors.flip(1).to(x.dtype)
-    turned = (centred @ axes).contiguous()
-
-    def look(rows: Tensor) -> tuple[Tensor, float]:
-        found: tuple[Tensor, float] = torch.ops.sw_codecs.nearest_entries((rows - centre) @ axes, turned)
-        return found
-
-    if look(x[:: max(len(x) // SAMPLE, 1)])[1] > SHARE:
-        return None
-    return lambda rows, _start: look(rows)[0]

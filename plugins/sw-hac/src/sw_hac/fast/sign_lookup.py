@@ -11,8 +11,8 @@ from torch.autograd.function import once_differentiable
 
 from splatwizard_native import fast_enabled
 from sw_codecs.context.fast.grid_lookup import MAX_FEATURES, MAX_LEVELS, Levels, levels_of
+from sw_codecs.context.fast.ordered_sums import largest_for_sums
 from sw_codecs.context.hash_grid import HashGrid
-from sw_codecs.context.ordered_sums import largest_for_sums
 from sw_codecs.native import CODECS
 
 Parts = Sequence[tuple[tuple[int, ...], HashGrid]]

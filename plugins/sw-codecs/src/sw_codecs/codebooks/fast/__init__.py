@@ -1,0 +1,1 @@
+"""Faster functions of the same signatures as the plain ones."""
