@@ -5,7 +5,8 @@ from types import SimpleNamespace
 import pytest
 
 from sw_codecs import exact_native
-from sw_codecs.context import hash_grid, integer_mlp
+from sw_codecs.context import integer_mlp
+from sw_codecs.context.fast import integer_grid
 from sw_codecs.entropy import conditional, exact_streams, lattice
 from sw_codecs.exact_native import EXACT
 from sw_codecs.testing import check_damage
@@ -19,7 +20,7 @@ def assert_survives_damage():
 @pytest.fixture
 def kernels(monkeypatch):
     """Let the exact mode run with its compiled kernels or without: `kernels(False)`."""
-    users = (hash_grid, integer_mlp, conditional, exact_streams, lattice, exact_native)
+    users = (integer_grid, integer_mlp, conditional, exact_streams, lattice, exact_native)
 
     def use(compiled):
         if compiled:

@@ -83,9 +83,11 @@ def _compare(expected: dict[str, Tensor], found: dict[str, Tensor], phase: str, 
 
 
 def check_without_kernels(encoded: Callable[[], bytes], decoded: Callable[[bytes], DecodedAnchors]) -> None:
-    """Raise unless a model's file, and what it decodes to, are the same without the kernels of exact coding."""
+    """Raise unless a file, and what it decodes to, are the same with SW_FAST=0, and without kernels of exact coding."""
     data = encoded()
     expected = decoded(data)
+    with mock.patch.dict("os.environ", SW_FAST="0"):
+        assert encoded() == data
     with (
         mock.patch.object(type(EXACT), "try_load", return_value=False),
         mock.patch.object(type(EXACT), "load_built", return_value=False),

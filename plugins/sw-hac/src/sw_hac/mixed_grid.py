@@ -12,9 +12,9 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
+from sw_codecs.context.fast import integer_grid
 from sw_codecs.context.hash_grid import HashGrid, table_size
 from sw_codecs.entropy.rates import mask_bits
-from sw_codecs.exact_native import EXACT
 from sw_hac.fast import sign_lookup
 
 Axes = tuple[int, ...]
@@ -95,14 +95,8 @@ class MixedHashGrid(nn.Module):
 
     def integer_features(self, codes: Tensor, dtype: torch.dtype = torch.int64) -> Tensor:
         """[n,3] 16-bit codes -> [n, width] with 12 fractional bits, at most 1 in magnitude: int64, or int16."""
-        first = self._all()[0]
-        if codes.device.type == "cpu" and first.features <= 16 and EXACT.try_load():
-            codes, column = codes.to(torch.int64).contiguous(), 0
-            found = codes.new_empty(len(codes), self.width, dtype=dtype)
-            for axes, grid in self.parts:
-                grid.kernel_features(codes, axes, found, column)
-                column += grid.width
-            return found
+        if integer_grid.fits(codes, self._all()[0].features):
+            return integer_grid.integer_features(self.parts, codes, dtype)
         return torch.cat([grid.integer_features(codes[:, list(axes)]) for axes, grid in self.parts], dim=1).to(dtype)
 
     def signs(self) -> Tensor:

@@ -20,8 +20,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from splatwizard_native import fast_enabled
-from sw_codecs.context.fast import grid_lookup
-from sw_codecs.exact_native import EXACT
+from sw_codecs.context.fast import grid_lookup, integer_grid
 from sw_codecs.quantizers.binary import SteBinary
 
 PRIMES = (1, 2654435761, 805459861)
@@ -103,14 +102,13 @@ class HashGrid(nn.Module):
             self.levels.append(Level(scale, resolution, size, start, vertices <= size))
             start += size
         self.table = nn.Parameter(torch.zeros(start, features))
-        self._signs: tuple[tuple[int, int], Tensor] | None = None
         if generator is not None:
             with torch.no_grad():
                 self.table.uniform_(-INITIAL, INITIAL, generator=generator)
         # Dense levels come first in the buffers below; `order` brings features back into the order of the levels.
         dense_first = sorted(range(len(self.levels)), key=lambda i: not self.levels[i].dense)
         chosen = [self.levels[i] for i in dense_first]
-        self._dense = sum(level.dense for level in chosen)
+        self.dense_levels = sum(level.dense for level in chosen)
         self._in_order = dense_first == list(range(len(chosen)))
         order = sorted(range(len(chosen)), key=lambda i: dense_first[i])
         for name, values, dtype in (
@@ -205,32 +203,16 @@ class HashGrid(nn.Module):
             raise ValueError("only a binary hash grid is looked up in integers")
         if codes.shape[1:] != (self.dimensions,) or codes.is_floating_point():
             raise ValueError(f"position codes must be integers [n, {self.dimensions}], not {list(codes.shape)}")
-        if codes.device.type == "cpu" and self.dimensions == 3 and self.features <= 16 and EXACT.try_load():
-            found = codes.new_empty(len(codes), self.width, dtype=torch.int64)
-            self.kernel_features(codes.to(torch.int64).contiguous(), (0, 1, 2), found, 0)
-            return found
+        if self.dimensions == 3 and integer_grid.fits(codes, self.features):
+            return integer_grid.integer_features([((0, 1, 2), self)], codes, torch.int64)
         signs = torch.where(self.table.detach() >= 0, 1.0, -1.0).to(torch.float64)
         blocks = [self._integer_block(block, signs) for block in codes.to(torch.int64).split(INTEGER_ROWS)]
         return torch.cat(blocks) if blocks else codes.new_zeros(0, self.width, dtype=torch.int64)
 
-    def kernel_features(self, codes: Tensor, axes: Sequence[int], into: Tensor, column: int) -> None:
-        """Write `integer_features` for some axes of codes int64 [n,3] into columns of `into` from `column` on."""
-        order = torch.argsort(self._order)  # buffers hold dense levels first
-        levels = torch.stack([self._last, self._start.to(torch.int64), column + order * self.features])
-        torch.ops.sw_codecs_exact.grid_features(
-            codes, list(axes), self._packed_signs(), self.features, levels, self._dense, self.log2_size, into
-        )
-
-    def _packed_signs(self) -> Tensor:
-        """[entries] int16: bit f is 1 where number f is not negative; kept as long as the table stays as it is."""
-        table = self.table.detach()
-        key = (table.data_ptr(), self.table._version)
-        if self._signs is None or self._signs[0] != key:
-            found = torch.zeros(len(table), dtype=torch.int32)
-            for f, column in enumerate(table.unbind(1)):
-                found |= (column >= 0).to(torch.int32) << f
-            self._signs = (key, found.to(torch.int16))
-        return self._signs[1]
+    def integer_levels(self, column: int) -> Tensor:
+        """[3, levels] last vertices, first entries and columns from `column` on, for a kernel: dense levels first."""
+        order = torch.argsort(self._order)
+        return torch.stack([self._last, self._start.to(torch.int64), column + order * self.features])
 
     def _integer_block(self, codes: Tensor, signs: Tensor) -> Tensor:
         inside = ((codes >= 0) & (codes <= POSITION_TOP)).all(dim=1)
@@ -257,7 +239,7 @@ class HashGrid(nn.Module):
     def _entries(self, lower: Sequence[Tensor]) -> Tensor:
         """[n,L,2^d] int32: entries of the table for the corners of cells, [n,L] for each axis; beyond the last vertex
         counts as it."""
-        dense, last = self._dense, self._last
+        dense, last = self.dense_levels, self._last
         straight, hashed = [], []
         # All hashed tables have one size, a power of two: the remainder is a mask, which may be taken early.
         mask = (1 << self.log2_size) - 1
