@@ -10,7 +10,7 @@ nothing to do. The first size has next to nothing for the device: its wall clock
 
 dense           preset `paper`
 fused           spherical harmonics updated in the backward pass (`fused_updates`)
-sparse          sparse_adam=per_row
+sparse          sparse_adam=true
 deterministic   deterministic=true: sums in one order
 """
 
@@ -46,9 +46,9 @@ TENSORS = ("means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats")
 SIZES = "2000@64x48,250000@799x532,1000000@799x532"
 VIEWS, ROUNDS, WARM_UP = 24, 3, 60
 # The plan of the first half, but for what changes the number of Gaussians.
-PLAN: dict[str, Any] = {"densify": {"start": 14_000, "stop": 15_000, "reset_interval": 15_000}}
+PLAN: dict[str, Any] = {"density": {"settings": {"start": 14_000, "stop": 15_000, "reset_interval": 15_000}}}
 VARIANTS: dict[str, dict[str, Any]] = {
-    "dense": {}, "fused": {}, "sparse": {"sparse_adam": "per_row"}, "deterministic": {},
+    "dense": {}, "fused": {}, "sparse": {"sparse_adam": True}, "deterministic": {},
 }  # fmt: skip
 # Part of a kernel's name -> phase; the first that fits.
 PHASES = (
@@ -95,8 +95,8 @@ def setting(variant: str) -> AbstractContextManager[None]:
 
 
 def trainer_of(variant: str, model: GaussianModel, scene: Scene, device: str) -> Trainer:
-    stage = ThreeDGSStage(ThreeDGSConfig.model_validate({**PLAN, **VARIANTS[variant]}))
-    stage.fuses_updates = variant == "fused"
+    config = ThreeDGSConfig.model_validate({**PLAN, **VARIANTS[variant]})
+    stage = ThreeDGSStage(config, fuses_updates=variant == "fused")
     ppl, streams = PipelineParams(device=device), Streams(0)
     rasterizer = NegotiatedRasterizer(load_plugins(), device=device)
     copy = GaussianModel.from_tensors(*(getattr(model, name).detach() for name in TENSORS)).to(device)

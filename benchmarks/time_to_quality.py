@@ -48,18 +48,17 @@ from splatwizard_core.training.pipeline import TrainingRun
 MIB = 1 << 20
 CLOSE = 0.05  # dB below the end of `paper`
 PARTS: Mapping[str, Mapping[str, Any]] = {
-    "budget": {"fast.densify": "threshold"},
-    "bound by evidence": {"fast.growth": 0.0},
-    "halving": {"fast.opacity": "reset", "densify.reset_interval": 3000},
-    "morton": {"fast.morton": False},
-    "sh cadence": {"fast.sh_every": 1},
-    "resolution": {"fast.resolution": "none"},
+    "budget": {"density": "adc"},
+    "bound by evidence": {"density.settings.growth": 0.0},
+    "halving": {"density.settings.opacity": "reset", "density.settings.reset_interval": 3000},
+    "morton": {"density.settings.morton": False},
+    "resolution": {"pictures.schedule": "none"},
     "average": {"fast.average": 0.0},
     "learning rates": {
         "fast.rates": "given", "lr.position_init": 1.6e-4, "lr.sh_dc": 2.5e-3, "lr.sh_rest": 1.25e-4,
         "lr.opacity": 0.05, "lr.scales": 5e-3, "lr.quats": 1e-3,
     },
-    "cap": {"fast.cap": 1_000_000},
+    "cap": {"density.settings.cap": 1_000_000},
 }  # fmt: skip
 """Part of a fast preset -> what leaves it out; a preset whose first key has that value is without the part anyway."""
 

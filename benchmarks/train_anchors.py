@@ -393,7 +393,7 @@ def explicit(
         drawn_there = drawn(splats)
     steps = args.baseline_steps
     cls = session.plugins.methods.load("3dgs")
-    sets = {"iterations": steps, "densify.stop": 0, "densify.white_reset": 0, "seed": args.seed}
+    sets = {"iterations": steps, "density.settings.stop": 0, "density.settings.white_reset": 0, "seed": args.seed}
     resolved = resolve(cls, "paper", sets=sets, scene=folder)
     trainer = trainer_of(make_method(session.plugins, resolved).stages()[0], splats, scene, resolved.ppl, rasterizer)
     clock: dict[int, float] = {}

@@ -105,7 +105,8 @@ def test_the_page_states_the_caps_of_the_code():
 def trained(tmp_path_factory):
     """A run directory: 3DGS on the smallest demo scene, all SH bands in use."""
     out = tmp_path_factory.mktemp("trained")
-    sets = [f"--set={pair}" for pair in ("iterations=150", "sh_interval=25", "densify.start=40", "densify.interval=20")]
+    pairs = ("iterations=150", "sh_interval=25", "density.settings.start=40", "density.settings.interval=20")
+    sets = [f"--set={pair}" for pair in pairs]
     assert main(["train", "--method", "3dgs", "--scene", "demo:tiny", "--out", str(out), *sets]) == 0
     (directory,) = (path.parent for path in out.glob("**/config.toml"))
     return directory

@@ -21,7 +21,7 @@ from splatwizard_core.plugins.catalogue import is_ours
 
 def offered(line: str, incomplete: str = "") -> list[str]:
     """What is offered after `sw LINE` for a word that begins with `incomplete`; a type where the shell lists paths."""
-    found = BashComplete(cli, {}, "sw", complete.VARIABLE).get_completions(line.split(), incomplete)
+    found = BashComplete(cli, {}, "sw", complete.COMPLETION_VARIABLE).get_completions(line.split(), incomplete)
     return [item.value if item.type == "plain" else f"<{item.type}>" for item in found]
 
 
@@ -91,7 +91,8 @@ def test_a_command_that_cannot_be_imported_spoils_no_completion(monkeypatch):
 
 def test_a_restriction_to_a_plugin_that_is_not_there_offers_nothing_and_says_nothing(monkeypatch, capsys):
     for name, value in {
-        "SW_PLUGINS": "no-such-plugin", complete.VARIABLE: "bash_complete", "COMP_WORDS": "sw ", "COMP_CWORD": "1"
+        "SW_PLUGINS": "no-such-plugin", complete.COMPLETION_VARIABLE: "bash_complete",
+        "COMP_WORDS": "sw ", "COMP_CWORD": "1",
     }.items():  # fmt: skip
         monkeypatch.setenv(name, value)
     load_plugins.cache_clear()
@@ -165,7 +166,7 @@ def test_completion_imports_nothing_heavy(line):
 def test_the_script_of_each_shell_asks_sw(shell, capsys):
     assert main(["completion", shell]) == 0
     script = capsys.readouterr().out
-    assert f"{complete.VARIABLE}={shell}_complete" in script
+    assert f"{complete.COMPLETION_VARIABLE}={shell}_complete" in script
     if shutil.which(shell):
         done = subprocess.run([shell, "-n"], input=script, capture_output=True, text=True, timeout=300, check=False)
         assert (done.returncode, done.stderr) == (0, "")
@@ -180,7 +181,7 @@ def test_bash_completes_a_line(tmp_path):
     lines = f"""
         eval "$(sw completion bash)"
         COMP_WORDS=(sw run --method 3d); COMP_CWORD=3
-        {BashComplete(cli, {}, "sw", complete.VARIABLE).func_name} sw
+        {BashComplete(cli, {}, "sw", complete.COMPLETION_VARIABLE).func_name} sw
         echo "got ${{COMPREPLY[*]}}"
     """
     done = subprocess.run(

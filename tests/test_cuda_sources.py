@@ -5,9 +5,9 @@ from __future__ import annotations
 import subprocess
 
 import pytest
+from sw_doctor.declared_modules import declared_modules
 
 from splatwizard_core.plugins import load_plugins
-from splatwizard_core.plugins.kernels import declared_modules
 from splatwizard_native import find_nvcc, resolve_module, toolchain
 
 MODULES = [resolve_module(target) for target in declared_modules(load_plugins())]

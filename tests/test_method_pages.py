@@ -37,5 +37,12 @@ def test_the_page_lists_every_setting_with_its_default(method):
         assert f"| `{key}` | {shown} | {description} |" in lines
 
 
+@pytest.mark.parametrize("control", [e.name for e in load_plugins().density_controls if is_ours(e.distribution)])
+def test_the_page_of_3dgs_lists_every_setting_of_every_density_control(control):
+    lines = (PAGES / "3dgs.md").read_text().splitlines()
+    for key, default, description in settings(load_plugins().density_controls.load(control).Settings()):
+        assert f"| `density.settings.{key}` | {default} | {description} |" in lines
+
+
 def test_all_methods_of_this_repository_are_looked_at():
     assert {path.stem for path in PAGES.glob("*.md")} == set(OWN)

@@ -1,8 +1,10 @@
-"""The example of a third party as of 0.2, unchanged, is installed beside this release and runs."""
+"""A package as of 0.2: the example of a third party, unchanged, is installed beside this release and runs."""
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import importlib
 import json
 import math
 import shutil
@@ -16,6 +18,7 @@ pytestmark = pytest.mark.pipeline
 
 PACKAGE = ROOT / "tests" / "golden" / "packages_0_2" / "sw-third-party"
 UNCHANGED = "6fe18339dd33df47"
+PROMISED = (PACKAGE.parent / "promised.txt").read_text("utf-8").split()
 SHORT = ("--set", "pretrained.iterations=40", "--set", "iterations=10")
 
 
@@ -35,6 +38,20 @@ def beside(tmp_path_factory: pytest.TempPathFactory, core_environment, wheels, w
     environment = core_environment.clone(tmp_path_factory.mktemp("beside") / "env")
     environment.install(*(each for name, each in wheels.items() if name != "splatwizard-core"), wheel)
     return environment
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.parametrize("name", PROMISED)
+def test_what_its_docs_promised_still_imports(name):
+    """The names of docs/plugins.md as of 0.2: of the core's face, and of libraries."""
+    found, parts = None, name.split(".")
+    for end in range(len(parts), 0, -1):
+        with contextlib.suppress(ModuleNotFoundError):
+            found = importlib.import_module(".".join(parts[:end]))
+            break
+    for part in parts[end:]:
+        found = getattr(found, part)
+    assert found is not None
 
 
 def test_it_is_as_it_was():

@@ -18,9 +18,9 @@ from splatwizard_core.training.stage import Stage
 
 PLUGINS = load_plugins()
 KEYS = {
-    "3dgs": "fast.resolution", "2dgs": "fast.resolution", "flat-3dgs": "fast.resolution",
-    "speedy-splat": "base.fast.resolution", "trim-2dgs-scratch": "base.fast.resolution",
-    "chimerags": "student.base.fast.resolution", "compact3dgs": "pictures.schedule",
+    "3dgs": "pictures.schedule", "2dgs": "pictures.schedule", "flat-3dgs": "pictures.schedule",
+    "speedy-splat": "base.pictures.schedule", "trim-2dgs-scratch": "base.pictures.schedule",
+    "chimerags": "student.base.pictures.schedule", "compact3dgs": "pictures.schedule",
     "hac": "pictures.schedule", "hac-plus": "pictures.schedule", "cat-3dgs": "pictures.schedule",
 }  # fmt: skip
 GROWTH = {"prune and densify", "adjust anchor"}

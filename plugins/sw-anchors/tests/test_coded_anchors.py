@@ -2,6 +2,7 @@
 
 import copy
 import math
+from contextlib import nullcontext
 
 import pytest
 import torch
@@ -9,7 +10,7 @@ from sw_anchors.coded_anchors import ENTROPY, FULL, QUANTIZED, CodedAnchors
 from sw_anchors.decoded_anchors import DecodedAnchors
 from sw_anchors.growth import adjust_anchors
 from sw_anchors.lattice import TOP, bounds_of, coded_positions, position_codes
-from sw_anchors.rate_model import AnchorForecast, gaussian_rate
+from sw_anchors.rate_model import AnchorContext, AnchorForecast, gaussian_rate
 from sw_reference.rasterizer import ReferenceRasterizer
 from sw_reference.testing.raster_scenes import front_camera
 
@@ -205,6 +206,33 @@ def test_the_rate_may_be_that_of_a_sample_of_all_anchors():
     assert rate.numbers == 60 * (5 + 6 + 12)
     rate.bits.backward()
     assert bool((model.features.grad != 0).any(dim=1).all())
+
+
+class Older(Flat):
+    """Flat as it was written for 0.2."""
+
+    rate_model, context_rows = CodedAnchors.rate_model, CodedAnchors.context_rows
+
+    def predict(self, rows):
+        widths, n = self.shape.widths, len(rows)
+        steps = self.log_steps.exp()
+        return AnchorContext(
+            tuple(torch.zeros(n, w) for w in widths),
+            tuple(torch.ones(n, w) for w in widths),
+            tuple(step.expand(n, 1) for step in steps),
+        )
+
+
+def test_a_subclass_that_predicts_as_in_0_2_has_the_same_rate_and_is_told():
+    rates = []
+    for kind in (Flat, Older):
+        model = make(n=60, kind=kind)
+        model.phase, model.sample, model.noise = ENTROPY, 0.5, torch.Generator().manual_seed(0)
+        with pytest.warns(DeprecationWarning, match="give a rate_model") if kind is Older else nullcontext():
+            rates.append(model.attributes(torch.arange(60)).extras["rate"].bits)
+    torch.testing.assert_close(*rates)
+    with pytest.raises(NotImplementedError, match="has no rate_model"):
+        CodedAnchors.rate_model.fget(make())
 
 
 def test_masks_remove_gaussians_and_learn_from_picture_and_rate():

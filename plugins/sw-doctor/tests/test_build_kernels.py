@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 
+from sw_doctor import declared_modules as kernels
+
 from splatwizard_core.cli.main import main
 from splatwizard_core.errors import SplatwizardError
-from splatwizard_core.plugins import kernels
 from splatwizard_core.plugins.manager import PluginManager
 from splatwizard_native import ForeseenError, NativeBuildError
 

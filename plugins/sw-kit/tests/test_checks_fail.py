@@ -19,7 +19,16 @@ from sw_kit.finding import BrokenContractError, NotCheckedError, PackageCheck
 from sw_kit.samples import some_gaussians
 from sw_kit.suite import checks_of
 
-from splatwizard_core.api import ConfigError, Method, MetricResult, OptimizationParams, Params, Stage, UserInputError
+from splatwizard_core.api import (
+    ConfigError,
+    DensityControl,
+    Method,
+    MetricResult,
+    OptimizationParams,
+    Params,
+    Stage,
+    UserInputError,
+)
 from splatwizard_core.tooling import Entry, PluginInfo, load_plugins
 
 PLUGINS = load_plugins()
@@ -266,6 +275,66 @@ class OneForAll(Pruner):
 def test_pruners_that_do_more_than_score(entry_of, pruner, said):
     with pytest.raises(BrokenContractError, match=said):
         BEHAVIOUR["pruner"](entry_of("pruner", pruner), PLUGINS)
+
+
+class Fading(DensityControl):
+    """Fades the Gaussians, the more the more often it was asked, and says so in its checkpoints."""
+
+    asked = 0
+
+    @property
+    def rounds(self):
+        return range(3_000, 24_000, 3_000)
+
+    def adjust(self, state):
+        self.asked += 1
+        state.optimizer.replace(state.model, "opacity_logits", state.model.opacity_logits - 0.1 * self.asked)
+        return {"faded": state.model.num_rows}
+
+    def state_dict(self):
+        return {"asked": self.asked}
+
+    def load_state_dict(self, state):
+        self.asked = state["asked"]
+
+
+class FadingForgets(Fading):
+    def state_dict(self):
+        return {}
+
+    def load_state_dict(self, state):
+        """It has nothing to restore."""
+
+
+class FadingAsks(Fading):
+    def needs(self, step):
+        return frozenset({"grad2d", "gradients"})
+
+
+class FadingLeaves(Fading):
+    def begin(self, state):
+        state.model.register_buffer("votes", torch.zeros(state.model.num_rows))
+        state.model.ROWS = (*state.model.ROWS, "votes")
+
+
+class FadingNeverAsked(Fading):
+    rounds = None
+
+
+def test_a_control_that_keeps_its_state_passes(entry_of):
+    entry = entry_of("density control", Fading)
+    assert "signatures of DensityControl" in check_target(entry, PLUGINS)
+    assert "resumes bit-equal" in BEHAVIOUR["density control"](entry, PLUGINS)
+
+
+@pytest.mark.parametrize(
+    ("control", "said"),
+    [(FadingForgets, "resumed ends as another model"), (FadingAsks, "needs names gradients"),
+     (FadingLeaves, "still has votes"), (FadingNeverAsked, "rounds is None"), (dict, "no DensityControl")],
+)  # fmt: skip
+def test_controls_that_do_not_keep_their_contract(entry_of, control, said):
+    with pytest.raises(BrokenContractError, match=said):
+        BEHAVIOUR["density control"](entry_of("density control", control), PLUGINS)
 
 
 def in_place(render, truth):

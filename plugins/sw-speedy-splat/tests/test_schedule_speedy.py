@@ -14,9 +14,10 @@ from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import Protocol, Scene, View
 from splatwizard_core.streams import stream
 from splatwizard_core.training.params import PipelineParams
+from splatwizard_core.training.rng import Streams
 from splatwizard_core.training.scheduler import build_schedulers, format_plan
-from splatwizard_core.training.stage import CameraIterator, StageContext
-from splatwizard_core.training.tasks import TaskContext
+from splatwizard_core.training.stage import StageContext
+from splatwizard_core.training.state import TrainingState
 from sw_speedy_splat.method import SpeedySplat
 
 PAPER_PLAN = """\
@@ -198,12 +199,8 @@ def counted(monkeypatch):
     model, scene = splats(1000), scene_of()
     context = StageContext(model, scene, PipelineParams(), None, lambda name: stream(0, name), lambda name: None)
     model = stage.begin(context)
-    optimizer = stage.create_optimizer(model, scene)
-    _, post = build_schedulers(stage, PipelineParams())
-    task = TaskContext(
-        PipelineParams(), stage.opt, model, scene, optimizer, CameraIterator(scene.train), NoRasterizer()
-    )
-    return post, task
+    state = TrainingState.begin(stage, model, scene, PipelineParams(), NoRasterizer(), Streams(0))
+    return state.post, state
 
 
 class NoRasterizer:

@@ -10,11 +10,10 @@ from splatwizard_native import lend
 MODULES = {
     "plugins.manager": "PluginManager load_plugins",
     "plugins.check": "Check State",
-    "plugins.kernels": "declared_modules",
     "plugins.registry": "Entry",
     "plugins.loading": "PluginInfo",
     "runs.record": "Record read_record SCHEMA FILE_NAME",
-    "training.figures": "Shown",
+    "base.block": "Shown",
     "training.state": "TrainingState",
     "runs.observers": "FinishedRun FinishedRuns StartedTraining TrainingObserver",
     "base.lock": "directory_lock",
@@ -27,7 +26,8 @@ MODULES = {
     "runs.decode": "export_model exporter_of open_model read_gaussians",
     "runs.session": "Session",
     "runs.device": "choose_device",
-    "runs.measure": "open_subject",
+    "runs.measure": "open_subject opener",
+    "gaussians.placement": "in_world",
     "scene.loading": "load_scene",
     "scene.locate": "DATA_VARIABLE",
     "training.pipeline": "TrainingRun TrainingStopped",
@@ -44,8 +44,10 @@ MODULES = {
         "methods_option options preset_option print_facts print_json print_table rates_option repeats_option say "
         "scene_option seeds_option set_option"
     ),
-    "cli.complete": "SCENE name_of",
-    "cli.paths": "EXISTING OUTPUT_FILE OUTPUT_FOLDER existing_file",
+    "cli.complete": "COMPLETION_VARIABLE SCENE SCENE_OR_FILE name_of",
+    "cli.paths": "EXISTING INPUT_FILE OUTPUT_FILE OUTPUT_FOLDER existing existing_file",
+    "cli.streams": "without_orders",
+    "runs.file_needs": "missing_parts missing_plugin",
     "cli.setup": "Choices open_session takes_choices",
     "plugins.remedies": "as_installed",
 }

@@ -85,15 +85,15 @@ def test_it_is_in_the_identity_and_in_config_toml_but_not_in_what_is_started_fro
     ("change", "told"),
     [
         (('"dim"', '"dimm"'), "no task is called 'dimm'; did you mean 'dim'?"),
-        (("by =", "bye ="), "it has no setting 'bye': did you mean 'by'?"),
-        (("0.25", '"much"'), "bad value 'much' for setting 'by': expected a number"),
-        (("0.25", "[1]"), "bad value [1] for setting 'by': Input should be a valid number"),
+        (("by =", "bye ="), "unknown key 'bye' in tasks, 1. 'dim': did you mean 'by'?"),
+        (("0.25", '"much"'), "bad value 'much' for 'by' in tasks, 1. 'dim': expected a number"),
+        (("0.25", "[1]"), "bad value [1] for 'by' in tasks, 1. 'dim': must be a valid number"),
         (("0.25", "-1"), "by is -1.0: it must be at least 0"),
         (("range(2, 6, 2)", "every 2"), "'every 2' is neither a step, a list of steps, nor range(first, end, every)"),
         (('"range(2, 6, 2)"', "[2, -4]"), "steps: step -4 is negative"),
         (("steps", "stpes"), "unknown key 'stpes' of [[tasks]]: did you mean 'steps'?"),
         (('name = "dim"', 'name = "dim"\nstage = "toi"'), "no stage is called 'toi': did you mean 'toy'?"),
-        (('"dim"', '"look"'), "it has no setting 'by': there is none"),
+        (('"dim"', '"look"'), "it has no settings: leave them out"),
     ],
 )
 def test_what_is_wrong_is_told_before_anything_runs(helped_plugins, tmp_path, change, told):

@@ -95,7 +95,7 @@ def test_steps_of_eight_digits_are_found_and_pruned(tmp_path):
     store = CheckpointStore(tmp_path)
     for step in (9_999_999, 10_000_000, 10_000_001):
         store.write(make(step))
-        assert store.newest().step == step
+        assert store.restored(lambda found: found).step == step
         assert len(list(tmp_path.iterdir())) == 2
 
 
@@ -111,7 +111,7 @@ def test_a_failed_write_leaves_the_old_one_and_no_rest(tmp_path, monkeypatch):
     with pytest.raises(OSError, match="disk full"):
         store.write(make(200))
     assert {p.name for p in tmp_path.iterdir()} == before
-    assert store.newest().step == 100
+    assert store.restored(lambda found: found).step == 100
 
 
 @pytest.mark.parametrize("failing", [1, 2])
@@ -215,12 +215,12 @@ def test_other_files_are_left_alone(tmp_path):
     store.write(make())
     store.clear()
     assert list(tmp_path.iterdir()) == [other]
-    assert store.newest() is None
+    assert store.restored(lambda found: found) is None
 
 
 def test_an_empty_or_missing_directory_has_none(tmp_path):
-    assert CheckpointStore(tmp_path).newest() is None
-    assert CheckpointStore(tmp_path / "missing").newest() is None
+    assert CheckpointStore(tmp_path).restored(lambda found: found) is None
+    assert CheckpointStore(tmp_path / "missing").restored(lambda found: found) is None
 
 
 def test_a_tensor_file_without_its_json_is_not_a_checkpoint(tmp_path):
@@ -228,7 +228,7 @@ def test_a_tensor_file_without_its_json_is_not_a_checkpoint(tmp_path):
     store.write(make(100))
     newer = store.write(make(200))
     newer.unlink()
-    assert store.newest().step == 100
+    assert store.restored(lambda found: found).step == 100
 
 
 def flip(path, position):
@@ -303,7 +303,7 @@ def test_the_one_before_a_damaged_one_is_taken(tmp_path, caplog):
         store.write(make(step))
     flip(tmp_path / "00-0000300.safetensors", -1)
     flip(tmp_path / "00-0000200.json", 40)
-    assert store.newest().step == 100
+    assert store.restored(lambda found: found).step == 100
     assert "tensor" in caplog.text
     assert "resuming from 00-0000100.json instead" in caplog.text
     # Set aside, so that it neither counts as newest again nor pushes out a good one.
@@ -316,7 +316,7 @@ def test_nothing_but_damage_is_an_error(tmp_path):
     store.write(make())
     flip(tmp_path / "00-0000100.safetensors", -1)
     with pytest.raises(CheckpointError, match="no earlier checkpoint is left"):
-        store.newest()
+        store.restored(lambda found: found)
 
 
 def test_differences_name_keys_tasks_and_extent():

@@ -180,7 +180,7 @@ def test_ctrl_c_on_the_way_from_step_to_step_saves_too(toy, tmp_path, monkeypatc
         patch.setattr(LoopClock, around, interrupt)
         with pytest.raises(KeyboardInterrupt):
             toy.train(directory=tmp_path / "a", on_step=lambda _, r: done.append(r.step), **options)
-    left = CheckpointStore(tmp_path / "a").newest()
+    left = CheckpointStore(tmp_path / "a").restored(lambda found: found)
     assert left is not None
     assert left.step == done[-1] == min(20, step + (around == "start"))
     resumed = toy.train(directory=tmp_path / "a", **options)
@@ -378,7 +378,7 @@ def test_a_state_that_cannot_be_restored_costs_only_the_steps_since_the_one_befo
     with pytest.raises(TrainingStopped):
         toy.train(iterations=30, directory=tmp_path, ppl=ppl, stop_after=20)
     store = CheckpointStore(tmp_path, keep=2)
-    saved = store.newest()
+    saved = store.restored(lambda found: found)
     assert saved.step == 20
     spoil(saved.state)
     store.write(saved)
@@ -392,7 +392,7 @@ def test_a_model_of_nothing_but_nan_is_an_error_at_the_end(toy, tmp_path):
     with pytest.raises(TrainingStopped):
         toy.train(iterations=20, directory=tmp_path, stop_after=19)
     store = CheckpointStore(tmp_path)
-    saved = store.newest()
+    saved = store.restored(lambda found: found)
     saved.state["model"]["means"].fill_(torch.nan)
     saved.step, saved.finished = 20, True
     store.write(saved)

@@ -2,7 +2,7 @@
 
 import json
 
-from splatwizard_core.training.run_log import RunLog
+from splatwizard_core.base.run_log import RunLog
 
 
 def lines(path):

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from sw_anchors.anchors import AnchorAttributes, AnchorModel
 from sw_anchors.fast import noisy_values as fast_values
 from sw_anchors.fast import replay
+from sw_anchors.forecasts import PredictedRate
 from sw_anchors.lattice import Margin, bounds_of, coded_positions, position_codes
 from sw_anchors.noisy_values import ENTROPY as ENTROPY
 from sw_anchors.noisy_values import FULL as FULL
@@ -158,11 +159,11 @@ class CodedAnchors(AnchorModel):
     @property
     def rate_model(self) -> RateModel:
         """Return the rate model: it predicts steps and distributions, in training and for the file."""
-        raise NotImplementedError
+        return PredictedRate(self)
 
     def context_rows(self) -> Context:
         """Return the tensors that the rate model predicts from, a row per anchor of the model."""
-        raise NotImplementedError
+        return (torch.arange(self.num_rows, device=self.device),)
 
     def context_of(self, rows: Tensor) -> Context:
         """Return these tensors for the anchors `rows`."""

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
+from sw_gaussians.morton import interleave
 from torch import Tensor, nn
 
 from splatwizard_core.api import BitstreamError
 from sw_anchors.lattice import BITS, TOP, coded_positions
-from sw_codecs.positions.morton import interleave
 
 if TYPE_CHECKING:
     from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager

@@ -8,7 +8,6 @@ import click
 
 from splatwizard_core.tooling import (
     debug_option,
-    declared_modules,
     json_option,
     load_plugins,
     options,
@@ -17,6 +16,7 @@ from splatwizard_core.tooling import (
     say,
 )
 from splatwizard_native import build_all
+from sw_doctor.declared_modules import declared_modules
 
 
 @click.command("build-kernels", short_help="compile all native modules ahead of time")

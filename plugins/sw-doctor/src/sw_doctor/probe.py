@@ -22,12 +22,12 @@ from splatwizard_core.tooling import (
     Entry,
     PluginInfo,
     State,
-    declared_modules,
     load_plugins,
 )
 from splatwizard_native import NativeBuildError, NativeModule
 from sw_doctor.child import Step, serve
 from sw_doctor.cures import cure_of
+from sw_doctor.declared_modules import declared_modules
 from sw_doctor.text import OF, SLOWLY, one_line
 
 if TYPE_CHECKING:

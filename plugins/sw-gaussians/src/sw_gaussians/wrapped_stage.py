@@ -34,6 +34,6 @@ def _of_inner(name: str, member: Any) -> Any:
 
 
 for _name, _member in vars(Stage).items():
-    # `when` scales by the hyper-parameters of the stage that asks.
-    if not _name.startswith("_") and _name not in ("name", "when"):
+    # `when` scales by the hyper-parameters of the stage that asks; tasks of a configuration are added to the outer one.
+    if not _name.startswith("_") and _name not in ("name", "when", "added"):
         setattr(WrappedStage, _name, _of_inner(_name, _member))

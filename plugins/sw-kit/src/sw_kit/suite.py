@@ -110,5 +110,16 @@ def _of_entry(entry: Entry, plugins: PluginManager, quick: bool, settings: Seque
     return found
 
 
-BEHAVES = ("pruner", "metric", "dataset", "rasterizer", "coder", "exporter", "importer", "check", "download")
+BEHAVES = (
+    "pruner",
+    "density control",
+    "metric",
+    "dataset",
+    "rasterizer",
+    "coder",
+    "exporter",
+    "importer",
+    "check",
+    "download",
+)
 """Kinds whose providers can be held to their contract without knowing more of them."""

@@ -14,7 +14,7 @@ from click.shell_completion import CompletionItem
 if TYPE_CHECKING:
     from splatwizard_core.plugins import Entry
 
-VARIABLE = "_SW_COMPLETE"
+COMPLETION_VARIABLE = "_SW_COMPLETE"
 """The shell's script sets it to ask `sw` for completions."""
 DATA = "SPLATWIZARD_DATA"  # the room that reads scenes has it too, and imports torch
 # What every method has (design: presets `paper` and `quick`, the aliases of rate points).

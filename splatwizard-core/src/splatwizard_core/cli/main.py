@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.shell_completion import CompletionItem
 
-from splatwizard_core.cli.complete import VARIABLE
+from splatwizard_core.cli.complete import COMPLETION_VARIABLE
 from splatwizard_core.cli.streams import abandon_streams, ended_like_ctrl_c, open_streams, without_orders
 from splatwizard_core.errors import PluginError, TaskError
 from splatwizard_core.plugins import load_plugins
@@ -133,7 +133,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _report(error: BaseException, arguments: Sequence[str], *, debug: bool) -> int:
     """One or two lines on stderr, and the exit status that the error leads to."""
-    if VARIABLE in os.environ and isinstance(error, ForeseenError):
+    if COMPLETION_VARIABLE in os.environ and isinstance(error, ForeseenError):
         return error.exit_status  # the shell asks for completions: TAB is not the place to say what is wrong
     culprit = _culprit(error, arguments)
     if isinstance(error, SystemExit) and culprit:

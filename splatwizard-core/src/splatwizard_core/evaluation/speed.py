@@ -12,13 +12,14 @@ import itertools
 import math
 import statistics
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
 import numpy as np
 import torch
+from pydantic import Field
 from torch import Tensor
 
+from splatwizard_core.base.block import Block, MemoryKind, WhyNull
 from splatwizard_native import MemoryMeter, synchronize, track, work_time
 
 WARMUP_FRAMES = 10
@@ -28,46 +29,53 @@ CUDA_SECONDS = 2.0
 View = TypeVar("View")
 
 
-@dataclass(frozen=True)
-class Spread:
-    """Spread of n >= 2 measurements of one thing; std is the sample's (n - 1)."""
+class SpreadBlock(Block):
+    """Spread of repeated measurements of one thing."""
 
-    n: int
+    n: int = Field(ge=2, description="measurements")
     mean: float
-    std: float
+    std: float = Field(description="of the sample (n - 1)")
     min: float
     max: float
 
 
-@dataclass(frozen=True)
-class SpeedReport:
-    """Rendering speed and peak memory.
+class SpeedBlock(Block):
+    """Rendering, by the FPS protocol, of the model decoded from the file."""
 
-    fps                 frames / total time, one synchronisation at both ends; over all repeats
-    latency_ms_median, latency_ms_p95   of single frames, synchronised around each; over all repeats
-    frames, rounds      behind `fps`; warm-up not counted
-    repeats             how often the measurement was made
-    views               different views
-    warmup_frames       drawn before
+    fps: float | None = Field(None, description="frames per second")
+    latency_ms_median: float | None = None
+    latency_ms_p95: float | None = None
+    jit_s: float | None = Field(None, description="loading or compiling native modules; in no other figure")
+    prepare_s: float | None = Field(None, description="view-independent caches, built once, not in `fps`")
+    load_s: float | None = Field(None, description="from opening the file to the first frame; without `jit_s`")
+    frames: int | None = Field(None, description="measured, over all repeats")
+    rounds: int | None = Field(None, description="over all views, in each repeat")
+    repeats: int | None = None
+    views: int | None = None
+    warmup_frames: int | None = Field(None, description="drawn before the clock starts")
+    spread: Annotated[dict[str, SpreadBlock] | None, WhyNull("measured once (--repeats N)")] = Field(
+        None, description="of fps and the latencies over the repeats"
+    )
+    image_size: tuple[int, int] | None = Field(None, description="width, height of the first view drawn")
+    drawn_by: dict[str, str] = Field({}, description="rasterizers that drew the frames -> whose kernels those are")
+    default_fps: dict[str, float] = Field(
+        {}, description="`fps` by the kernels that draw where a file names none; empty: those drew the frames"
+    )
+
+
+class SpeedReport(SpeedBlock):
+    """What `measure_speed` tells: of the record's block, what it can know, and besides
+
     first_frame_s       the first frame of all, a part of the warm-up
-    spread              of "fps", "latency_ms_median" and "latency_ms_p95" over the repeats; None for a single one
     peak_bytes          memory over the measured rounds; `memory_kind` says which: "cuda" (allocator) or "rss" (growth)
     peak_reserved_bytes the allocator's pool; None on a CPU
     """
 
     fps: float
-    latency_ms_median: float
-    latency_ms_p95: float
-    frames: int
-    rounds: int
-    repeats: int
-    views: int
-    warmup_frames: int
     first_frame_s: float
-    spread: dict[str, Spread] | None
     peak_bytes: int
     peak_reserved_bytes: int | None
-    memory_kind: str
+    memory_kind: MemoryKind
 
 
 def measure_speed(
@@ -143,6 +151,7 @@ def measure_speed(
     )  # fmt: skip
 
 
-def spread(values: Sequence[float]) -> Spread:
+def spread(values: Sequence[float]) -> SpreadBlock:
     """Mean, sample standard deviation, least and largest of at least two values."""
-    return Spread(len(values), statistics.fmean(values), statistics.stdev(values), min(values), max(values))
+    mean, std = statistics.fmean(values), statistics.stdev(values)
+    return SpreadBlock(n=len(values), mean=mean, std=std, min=min(values), max=max(values))

@@ -144,7 +144,7 @@ class ResolvedConfig:
 
     @functools.cached_property
     def _reading(self) -> SceneParams:
-        """How the scene is read, with what a file of names holds in place of where it lies."""
+        """The scene options, with what a file of names holds in place of where it lies."""
         split = self.scene.split
         told = f"sha256 {file_sha256(Path(split))}" if _is_list(split) else split
         return SceneParams(**{**self.scene_options, "split": told})

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import statistics
-from dataclasses import asdict
 from pathlib import Path
 
 import torch
@@ -20,7 +19,6 @@ from splatwizard_core.method import Method
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.runs.facts import DecodingFacts, contention
 from splatwizard_core.runs.file_needs import missing_plugin, other_versions, upgrade_command
-from splatwizard_core.runs.record import SpreadBlock
 from splatwizard_core.runs.session import Session
 from splatwizard_native import CoreTime, MemoryMeter, loading_time, replacing, synchronize, track, work_time
 
@@ -133,7 +131,7 @@ def timed_decode(path: Path, session: Session, *, repeats: int = REPEATS) -> tup
         raster=reader.raster,
         decode_s=statistics.median(runs) if runs else first,
         decode_runs_s=runs,
-        decode_spread=SpreadBlock(**asdict(spread(runs))) if len(runs) > 1 else None,
+        decode_spread=spread(runs) if len(runs) > 1 else None,
         first_decode_s=first,
         jit_s=loading_time(),
         contended=contended,

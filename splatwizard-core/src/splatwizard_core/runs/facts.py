@@ -6,16 +6,17 @@ from typing import Any
 
 from pydantic import Field
 
+from splatwizard_core.base.block import Block, MemoryKind
+from splatwizard_core.evaluation.speed import SpeedBlock
 from splatwizard_core.runs.record import (
     DecodeFigures,
     MemoryBlock,
     PhaseBlock,
     PretrainingBlock,
     Quality,
-    SpeedBlock,
     TrainBlock,
 )
-from splatwizard_core.training.figures import Block, MemoryKind, Provided, StagePlan
+from splatwizard_core.training.figures import Provided, StagePlan
 from splatwizard_native import CoreTime
 
 CONTENDED = "contended"

@@ -12,7 +12,7 @@ import torch
 
 from splatwizard_core.evaluation import evaluate as quality
 from splatwizard_core.evaluation.metrics import MetricSetup, chosen_metrics
-from splatwizard_core.evaluation.speed import SpeedReport, measure_speed
+from splatwizard_core.evaluation.speed import SpeedBlock, SpeedReport, measure_speed
 from splatwizard_core.gaussians.placement import placed_in
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.plugins import PluginManager
@@ -20,7 +20,7 @@ from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.runs.config import ResolvedConfig
 from splatwizard_core.runs.decode import import_method, open_model, read_gaussians
 from splatwizard_core.runs.facts import Measurement, contention
-from splatwizard_core.runs.record import MemoryBlock, MetricBlock, ProtocolBlock, SpeedBlock
+from splatwizard_core.runs.record import MemoryBlock, MetricBlock, ProtocolBlock
 from splatwizard_core.runs.session import Session
 from splatwizard_core.runs.training_views import training_psnr
 from splatwizard_core.scene.camera import Camera
@@ -125,7 +125,7 @@ def measure(
     speeds, memory = None, None
     if report is not None:
         first = speed_views[0].camera
-        told = asdict(report) | drawn | {
+        told = report.model_dump() | drawn | {
             "jit_s": loading_time(),
             "prepare_s": prepare_s,
             "load_s": open_s + prepare_s + report.first_frame_s,

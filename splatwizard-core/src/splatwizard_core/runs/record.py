@@ -1,9 +1,9 @@
 """The result record, metrics.json, that every table is made from. A versioned schema; unknown values are null.
 
 A value that is null has its reason in `unknown`, by dotted name; no value is ever 0 for "not measured".
-A field is declared here (or in `training.figures`) and filled where it is measured. From the declaration follow why it
-may be null (`WhyNull`), its row of docs/protocol.md (tools/record_docs.py), what readers of other releases' records
-take, and with `Shown` its row in the report.
+A field is declared here (or in `training.figures`, `evaluation.speed`) and filled where it is measured. From the
+declaration follow why it may be null (`WhyNull`), its row of docs/protocol.md (tools/record_docs.py), what readers of
+other releases' records take, and with `Shown` its row in the report.
 Source: evaluation protocol, result record.
 """
 
@@ -15,8 +15,10 @@ from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field, ValidationError
 
+from splatwizard_core.base.block import Block, MemoryKind, Shown, WhyNull
 from splatwizard_core.errors import SplatwizardError, UserInputError
-from splatwizard_core.training.figures import Block, LoopFigures, MemoryKind, Provided, Shown, StagePlan, WhyNull
+from splatwizard_core.evaluation.speed import SpeedBlock, SpreadBlock
+from splatwizard_core.training.figures import LoopFigures, Provided, StagePlan
 from splatwizard_native import load_strict, write_atomic
 
 SCHEMA = 3
@@ -59,40 +61,6 @@ class TrainingPsnrBlock(Block):
     median: float | None = None
     quantile_05: float | None = Field(None, description="5 % of the views have this or less")
     far_below: dict[str, float] = Field({}, description="views more than 8 dB below the median, the lowest first")
-
-
-class SpreadBlock(Block):
-    """Spread of repeated measurements of one thing."""
-
-    n: int = Field(ge=2, description="measurements")
-    mean: float
-    std: float = Field(description="of the sample (n - 1)")
-    min: float
-    max: float
-
-
-class SpeedBlock(Block):
-    """Rendering, by the FPS protocol, of the model decoded from the file."""
-
-    fps: float | None = Field(None, description="frames per second")
-    latency_ms_median: float | None = None
-    latency_ms_p95: float | None = None
-    jit_s: float | None = Field(None, description="loading or compiling native modules; in no other figure")
-    prepare_s: float | None = Field(None, description="view-independent caches, built once, not in `fps`")
-    load_s: float | None = Field(None, description="from opening the file to the first frame; without `jit_s`")
-    frames: int | None = Field(None, description="measured, over all repeats")
-    rounds: int | None = Field(None, description="over all views, in each repeat")
-    repeats: int | None = None
-    views: int | None = None
-    warmup_frames: int | None = Field(None, description="drawn before the clock starts")
-    spread: Annotated[dict[str, SpreadBlock] | None, WhyNull("measured once (--repeats N)")] = Field(
-        None, description="of fps and the latencies over the repeats"
-    )
-    image_size: tuple[int, int] | None = Field(None, description="width, height of the first view drawn")
-    drawn_by: dict[str, str] = Field({}, description="rasterizers that drew the frames -> whose kernels those are")
-    default_fps: dict[str, float] = Field(
-        {}, description="`fps` by the kernels that draw where a file names none; empty: those drew the frames"
-    )
 
 
 class MemoryBlock(Block):

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
+from splatwizard_core.base.block import Block
 from splatwizard_core.base.lock import directory_lock, is_held
 from splatwizard_core.errors import SplatwizardError
 from splatwizard_core.evaluation.evaluate import evaluate, kept_header, raster_header
@@ -27,7 +28,7 @@ from splatwizard_core.runs.session import Session, TrainedModel
 from splatwizard_core.scene.images import decode_all
 from splatwizard_core.streams import stream
 from splatwizard_core.training.checkpoint import CheckpointStore
-from splatwizard_core.training.figures import Block, LoopFigures
+from splatwizard_core.training.figures import LoopFigures
 from splatwizard_core.training.pipeline import TrainingRun
 from splatwizard_native import CoreTime, sweep, write_atomic
 

@@ -8,12 +8,12 @@ import typing
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ConfigDict, create_model
 
-from splatwizard_core.base.values import parse_text
 from splatwizard_core.errors import ConfigError, PluginError
-from splatwizard_core.plugins import Entry, PluginManager
-from splatwizard_core.training.keys import suggest
+from splatwizard_core.plugins import PluginManager
+from splatwizard_core.plugins.registry import nearest
+from splatwizard_core.training.overrides import apply_overrides
 from splatwizard_core.training.params import AddedTask
 from splatwizard_core.training.plan import When, check_when
 from splatwizard_core.training.stage import PlannedTask, Stage
@@ -31,10 +31,11 @@ def add_tasks(stages: Sequence[Stage], tasks: Iterable[AddedTask], plugins: Plug
         where = f"tasks, {number}. '{each.name}'"
         names = [stage.name for stage in stages]
         if each.stage and each.stage not in names:
-            raise _error(where, f"no stage is called '{each.stage}'", each.stage, names)
+            near = nearest("stage", each.stage, names)
+            raise ConfigError(f"{where}: no stage is called '{each.stage}': {near}", key="tasks")
         stage = stages[names.index(each.stage) if each.stage else 0]
         planned = PlannedTask(each.before_render, _steps(where, each.steps), _made(where, each, plugins), each.priority)
-        stage.added = (*stage.added, planned._replace(name=each.name))
+        stage.extra_tasks = (*getattr(stage, "extra_tasks", ()), planned._replace(name=each.name))
     return list(stages)
 
 
@@ -59,41 +60,27 @@ def _made(where: str, asked: AddedTask, plugins: PluginManager) -> Callable[...,
         if error.name is None:  # it is there, but broken or claimed twice
             raise
         raise ConfigError(f"{where}: {error}", key="tasks") from error
-    settings = _parsed(where, entry, target, asked.settings)
     if not entry.declared.get("factory"):
+        if asked.settings:
+            raise ConfigError(f"{where}: it has no settings: leave them out", key="tasks")
         return target
     with plugins.guarding(plugins.tasks, asked.name):
         try:
-            return target(**settings)  # type: ignore[no-any-return]
+            return target(**_parsed(where, target, asked.settings))  # type: ignore[no-any-return]
         except ValueError as error:
             raise ConfigError(f"{where}: {error}", key="tasks") from error
 
 
-def _parsed(where: str, entry: Entry, target: Any, given: dict[str, Any]) -> dict[str, Any]:
+def _parsed(where: str, factory: Any, given: dict[str, Any]) -> dict[str, Any]:
     """Return the settings as the parameters of a factory take them."""
-    parameters = inspect.signature(target).parameters if entry.declared.get("factory") else {}
     try:
-        hints = typing.get_type_hints(target.__init__ if inspect.isclass(target) else target)
+        hints = typing.get_type_hints(factory.__init__ if inspect.isclass(factory) else factory)
     except (NameError, TypeError):  # names for type checkers alone
         hints = {}
-    found = {}
-    for key, value in given.items():
-        if key not in parameters:
-            raise _error(where, f"it has no setting '{key}'", key, list(parameters))
-        kind = hints.get(key, Any)
-        try:
-            parsed = parse_text(kind, value) if isinstance(value, str) else value
-            found[key] = TypeAdapter(kind).validate_python(parsed)
-        except ValueError as error:
-            reason = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
-            raise ConfigError(f"{where}: bad value {value!r} for setting '{key}': {reason}", key="tasks") from None
-    missing = [name for name, p in parameters.items() if p.default is p.empty and name not in found]
-    if missing:
-        raise ConfigError(f"{where}: it needs settings {', '.join(missing)}", key="tasks")
-    return found
-
-
-def _error(where: str, problem: str, asked: str, known: list[str]) -> ConfigError:
-    near = suggest(asked, known)
-    hint = f"did you mean '{near}'?" if near else f"there {'are' if known else 'is none'} {', '.join(known)}".rstrip()
-    return ConfigError(f"{where}: {problem}: {hint}", key="tasks")
+    fields: dict[str, Any] = {
+        name: (hints.get(name, Any), ... if p.default is p.empty else p.default)
+        for name, p in inspect.signature(factory).parameters.items()
+    }
+    settings = create_model("Settings", __config__=ConfigDict(arbitrary_types_allowed=True), **fields)
+    found = apply_overrides(settings.model_construct(), given, source=where)
+    return {name: getattr(found, name) for name in given}

@@ -26,8 +26,9 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from splatwizard_core.base.block import Block
 from splatwizard_core.errors import CheckpointError
-from splatwizard_core.training.figures import Block, TrainingFigures
+from splatwizard_core.training.figures import TrainingFigures
 from splatwizard_core.training.keys import dotted
 from splatwizard_native import TEMPORARY, replacing
 
@@ -143,10 +144,6 @@ class CheckpointStore:
         for problem in problems.values():
             raise CheckpointError(f"{problem}; no earlier checkpoint is left, so start again (--fresh)")
         return None
-
-    def newest(self) -> Checkpoint | None:
-        """`restored`, of a checkpoint that nothing but its own sums is held against."""
-        return self.restored(lambda found: found)
 
     def last_of(self, stage: int) -> Checkpoint:
         """Return the checkpoint that finished a stage. Raises CheckpointError."""

@@ -2,37 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field
+from pydantic import AliasChoices, Field
 
-MemoryKind = Literal["cuda", "rss"]
-"""What was measured as memory: torch's allocator, or the growth of the resident set."""
-
-
-class Block(BaseModel):
-    """Base of every block: no number that is not finite; keys that only another release has are passed over."""
-
-    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False, populate_by_name=True)
-
-
-@dataclass(frozen=True)
-class WhyNull:
-    """Marks a field with the reason of its null, where whoever measured it told none."""
-
-    reason: str
-
-
-@dataclass(frozen=True)
-class Shown:
-    """Marks a field that the report of a run shows among times and memory, its description beside it.
-
-    unit    "s", "bytes", or "" for a count
-    """
-
-    label: str
-    unit: Literal["s", "bytes", ""] = ""
+from splatwizard_core.base.block import Block, MemoryKind, WhyNull
 
 
 class Provided(Block):

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from splatwizard_core.base.run_log import RunLog
 from splatwizard_core.errors import CheckpointError, ConfigError
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.rendering.features import Feature
@@ -29,7 +30,6 @@ from splatwizard_core.training.housekeeping import Evaluate, Housekeeping, OnSte
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.plan import plan_rows
 from splatwizard_core.training.rng import Streams
-from splatwizard_core.training.run_log import RunLog
 from splatwizard_core.training.scheduler import build_schedulers
 from splatwizard_core.training.stage import Stage, StageContext
 from splatwizard_core.training.state import TrainingState

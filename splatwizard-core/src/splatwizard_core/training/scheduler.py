@@ -125,7 +125,7 @@ def build_schedulers(stage: Stage, ppl: PipelineParams) -> tuple[Scheduler, Sche
     pre, post = Scheduler("pre"), Scheduler("post")
     stage.register_pre_task(pre, ppl, stage.opt)
     stage.register_post_task(post, ppl, stage.opt)
-    for each in stage.added:
+    for each in getattr(stage, "extra_tasks", ()):  # one that calls no __init__ of ours has none
         (pre if each.before_render else post).register_task(
             each.when, each.task, priority=each.priority, name=each.name
         )

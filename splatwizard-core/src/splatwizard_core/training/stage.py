@@ -95,14 +95,15 @@ class Stage:
 
     name        shown in plans and logs
     opt         the hyper-parameters that its tasks see as OptimizationParams; a borrowed stage brings its own
-    added       tasks that the configuration puts into the plan besides the stage's own
+    extra_tasks tasks that the configuration puts into the plan besides the stage's own
     """
 
     name: str = "train"
-    added: tuple[PlannedTask, ...] = ()
+    extra_tasks: tuple[PlannedTask, ...]
 
     def __init__(self, opt: OptimizationParams) -> None:
         self.opt = opt
+        self.extra_tasks = ()
 
     @property
     def iterations(self) -> int:

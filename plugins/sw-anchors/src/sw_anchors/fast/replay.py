@@ -15,6 +15,7 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 import torch
+from sw_gaussians.morton import interleave
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
@@ -33,7 +34,6 @@ from sw_anchors.fast.rows import add_rows, put_rows
 from sw_anchors.fast.seen_rows import ExpectedRows, SeenRows, capacity_of
 from sw_anchors.native import ANCHORS
 from sw_anchors.noisy_values import ENTROPY
-from sw_codecs.positions.morton import interleave
 
 log = logging.getLogger(__name__)
 

@@ -74,14 +74,20 @@ def add_rows(rows: Tensor, sources: Sequence[Tensor | None], into: Sequence[Tens
         target.index_add_(0, rows, source)
 
 
+def gathered(rows: Tensor, tensors: Sequence[Tensor]) -> list[Tensor]:
+    """Rows [S] (int64) of each tensor [N,...], which may be named more than once; without gradients."""
+    if fit_kernels(*tensors):
+        found: list[Tensor] = torch.ops.sw_anchors.take_rows(rows, list(tensors))
+        return found
+    return [t.index_select(0, rows) for t in tensors]
+
+
 class _TakeRows(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, rows: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
         ctx.save_for_backward(rows)
         ctx.count = len(tensors[0])
-        if fit_kernels(*tensors):
-            return tuple(torch.ops.sw_anchors.take_rows(rows, list(tensors)))
-        return tuple(t.index_select(0, rows) for t in tensors)
+        return tuple(gathered(rows, tensors))
 
     @staticmethod
     @once_differentiable

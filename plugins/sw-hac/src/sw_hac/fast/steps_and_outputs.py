@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 from sw_anchors.fast.predicted_steps import steps_by_torch, steps_fit_kernel
+from sw_anchors.fast.rows import add_rows, gathered
 from sw_anchors.native import ANCHORS
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
@@ -57,11 +58,10 @@ class _StepsAndOutputs(torch.autograd.Function):
         by_kernel = steps_fit_kernel(features, *parameters, base)
         form = torch.ops.sw_anchors.predicted_steps if by_kernel else steps_by_torch
         steps, hidden, tangents = form(features, parameters, base, OFFSET, SMALLEST_STEP)
-        own = hidden[sample] if isinstance(sample, slice) else hidden.index_select(0, sample)
         rows = None if isinstance(sample, slice) else sample
+        own, of_sample = (hidden[sample], steps[sample].clone()) if rows is None else gathered(rows, (hidden, steps))
         ctx.save_for_backward(features, first, first_bias, last, last_bias, base, hidden, tangents, own, rows)
         ctx.sample, ctx.part, ctx.by_kernel = sample, part, by_kernel
-        of_sample = steps[sample].clone() if rows is None else steps.index_select(0, rows)
         return steps, of_sample, torch.addmm(last_bias, own, last.t())
 
     @staticmethod
@@ -70,9 +70,14 @@ class _StepsAndOutputs(torch.autograd.Function):
         features, first, first_bias, last, last_bias, base, hidden, tangents, own, rows = ctx.saved_tensors
         part = ctx.part
         to_last, to_last_bias = torch.mm(to_outputs.t(), own), to_outputs.sum(dim=0)
-        to_steps = _plus(to_steps.clone(), ctx.sample, to_own)
+        to_steps, to_wide = to_steps.clone(), torch.mm(to_outputs, last)
+        if rows is None:
+            to_steps[ctx.sample] += to_own
+        else:
+            add_rows(rows, [to_own], [to_steps])
         if ctx.by_kernel:
-            to_hidden = _plus(torch.zeros_like(hidden), ctx.sample, torch.mm(to_outputs, last))
+            to_hidden = torch.zeros_like(hidden)
+            to_hidden[ctx.sample if rows is None else rows] = to_wide
             parameters = [t.contiguous() for t in (first, first_bias, last[part], last_bias[part])]
             to_features, to_first, to_first_bias, *of_steps = torch.ops.sw_anchors.predicted_steps_backward(
                 features, parameters, base, OFFSET, SMALLEST_STEP, hidden, tangents, to_steps.contiguous(), to_hidden
@@ -84,20 +89,12 @@ class _StepsAndOutputs(torch.autograd.Function):
             to_tangents *= tangents >= SMALLEST_STEP - OFFSET
             to_hidden = torch.mm(to_tangents, last[part])
             if rows is None:
-                to_hidden[ctx.sample].addmm_(to_outputs, last)
+                to_hidden[ctx.sample] += to_wide
             else:
-                to_hidden.index_add_(0, rows, torch.mm(to_outputs, last))
+                add_rows(rows, [to_wide], [to_hidden])
             torch.ops.aten.threshold_backward.grad_input(to_hidden, hidden, 0, grad_input=to_hidden)
             to_last[part].addmm_(to_tangents.t(), hidden)
             to_last_bias[part] += to_tangents.sum(dim=0)
             to_features, to_first = torch.mm(to_hidden, first), torch.mm(to_hidden.t(), features)
             to_first_bias = to_hidden.sum(dim=0)
         return to_features, to_first, to_first_bias, to_last, to_last_bias, None, None, None
-
-
-def _plus(into: Tensor, sample: Tensor | slice, source: Tensor) -> Tensor:
-    """Add rows of a source [S,...] to the rows `sample` of a tensor, in place; return it."""
-    if isinstance(sample, slice):
-        into[sample] += source
-        return into
-    return into.index_add_(0, sample, source)

@@ -15,6 +15,7 @@ from PIL import Image
 from splatwizard_core.api import CapabilityError, MetricResult, MetricSetup, PreparedMetric, RasterOptions, Subject
 from splatwizard_core.tooling import Check, NegotiatedRasterizer
 from sw_kit.checks.coding import check_coder
+from sw_kit.checks.density import check_density_control
 from sw_kit.checks.rasterizer import check_rasterizer
 from sw_kit.checks.targets import make
 from sw_kit.finding import NotCheckedError, hold
@@ -193,6 +194,7 @@ def check_download(entry: Entry, plugins: PluginManager) -> str:
 
 BEHAVIOUR: Mapping[str, Callable[[Entry, PluginManager], str]] = {
     "pruner": check_pruner,
+    "density control": check_density_control,
     "metric": check_metric,
     "dataset": check_dataset,
     "rasterizer": check_rasterizer,

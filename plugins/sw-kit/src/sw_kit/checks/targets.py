@@ -30,6 +30,7 @@ CONTRACTS: dict[str, type] = {
     "context model": api.ContextModel,
     "dataset": api.Dataset,
     "method": api.Method,
+    "density control": api.DensityControl,
 }
 ARGUMENTS = {"metric": 2, "exporter": 2, "importer": 1, "check": 0, "download": 0}
 """Kinds that are plain functions -> how many positional arguments they are called with."""
@@ -65,7 +66,7 @@ def check_target(entry: Entry, plugins: PluginManager) -> str:
     made = make(entry, plugins)
     if made is not None:
         _follows(made, contract, whose)
-    settings = _check_settings(entry, plugins, whose) if entry.kind in ("pruner", "coder") else ""
+    settings = _check_settings(entry, plugins, whose) if entry.kind in ("pruner", "coder", "density control") else ""
     return f"is made with its defaults{settings}, and has the signatures of {contract.__name__}"
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from splatwizard_core.plugins.kernels import CORE_MODULES, declared_modules
+from sw_doctor.declared_modules import CORE_MODULES, declared_modules
+
 from splatwizard_core.plugins.manager import PluginManager
 from splatwizard_native import NativeModule, resolve_module
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from splatwizard_core.plugins.manager import PluginManager
+    from splatwizard_core.tooling import PluginManager
 
 CORE_MODULES = ("splatwizard_native.fused.native:TRAINING",)
 

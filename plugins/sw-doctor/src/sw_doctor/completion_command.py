@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import click
 
-from splatwizard_core.cli.complete import VARIABLE
-from splatwizard_core.cli.options import debug_option, options
+from splatwizard_core.tooling import COMPLETION_VARIABLE, debug_option, options
 
 
 @click.command(short_help="completion for bash, zsh or fish")
@@ -24,4 +23,4 @@ def completion(context: click.Context, shell: str) -> None:
 
     found = get_completion_class(shell)
     assert found is not None  # click knows all three
-    click.echo(found(context.find_root().command, {}, "sw", VARIABLE).source(), nl=False)
+    click.echo(found(context.find_root().command, {}, "sw", COMPLETION_VARIABLE).source(), nl=False)
