@@ -94,13 +94,13 @@ def test_setting_up_makes_planes_of_the_anchors_resolution_and_predicts_their_st
     assert model.context.resolution == 0
     stage.setup_triplane(model, optimizer)
     assert model.context.resolution == round((model.num_rows / 4) ** 0.5)
-    context = model.predict(torch.arange(model.num_rows))
+    context = model.context(model.places()[torch.arange(model.num_rows)])
     assert (context.means[0] - model.features.mean(0)).abs().max() < 0.1
     assert (context.scales[0] - model.features.std(0)).abs().max() < 0.1
     for step, base in zip(context.steps, (1.0, 0.001, 0.2), strict=True):
         assert step.detach() == pytest.approx(1.1 * base, rel=0.1)
     model.context.fold_units()
-    folded = model.predict(torch.arange(model.num_rows))
+    folded = model.context(model.places()[torch.arange(model.num_rows)])
     for before, after in zip((*context.means, *context.scales), (*folded.means, *folded.scales), strict=True):
         assert torch.allclose(before, after, rtol=1e-4, atol=1e-7)
     places = model.places()
@@ -129,10 +129,10 @@ def test_untrained_slices_refine_nothing_and_the_parts_sum_to_the_whole(begun, l
     stage.setup_triplane(model, optimizer)
     model.phase = ENTROPY
     rows = torch.arange(model.num_rows)
-    plain = model.predict(rows)
-    refined = model.context.refine(plain, model.features[rows])
-    assert torch.equal(refined.means[0], plain.means[0])
-    assert torch.equal(refined.scales[0], plain.scales[0])
+    plain = model.context(model.places()[rows])
+    means, scales = model.context.refined(plain.means, plain.scales, model.features[rows])
+    assert torch.equal(means[0], plain.means[0])
+    assert torch.equal(scales[0], plain.scales[0])
     inputs = model.gaussians(little_scene.train[0].camera, rasterizer)
     rate = inputs.extras["rate"]
     share = rate.numbers / (model.num_rows * sum(model.context.shape.widths))
@@ -167,7 +167,7 @@ def test_the_state_of_a_phase_survives_a_checkpoint(begun):
     assert again.context.rounded
     assert [p.requires_grad for p in again.parameters()] == [p.requires_grad for p in model.parameters()]
     rows = torch.arange(5)
-    assert torch.equal(again.predict(rows).means[1], model.predict(rows).means[1])
+    assert torch.equal(again.context(again.places()[rows]).means[1], model.context(model.places()[rows]).means[1])
 
 
 @pytest.mark.parametrize("values", [{}, {"context__refine": True}, {"context__units": "steps"}])
@@ -183,10 +183,11 @@ def test_what_training_forecasts_for_a_sample_is_what_is_predicted(begun, values
     rows, drawn = torch.arange(model.num_rows).flip(0), torch.tensor([3, 1])
     learned = [p for name, p in model.context.named_parameters() if not name.startswith("arms")]
     noisy = torch.cat(model.raw(rows), dim=1).detach()
-    context = model.context.refine(model.predict(rows), noisy[:, : model.features.shape[1]])
+    context = model.context(model.places()[rows])
+    refined = model.context.refined(context.means, context.scales, noisy[:, : model.features.shape[1]])
     forecast = model.rate_model.forecast(model.context_of(rows), drawn)
     mean, scale = model.rate_model.read(forecast, noisy[drawn])
-    expected = [torch.cat(parts, dim=1) for parts in (context.steps, context.means, context.scales)]
+    expected = [torch.cat(parts, dim=1) for parts in (context.steps, *refined)]
     expected = [expected[0], expected[1][drawn], expected[2][drawn]]
     found = [forecast.steps, mean, scale]
     for a, b in zip(found, expected, strict=True):

@@ -1,5 +1,6 @@
 """spatial-ar: causal, decodes along wavefronts what it coded, learns, and costs what it estimates."""
 
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -31,7 +32,7 @@ def network(seed=0, scale=1.0):
 
 
 def exact_networks(count=3):
-    return [SpatialAr.exact(network(seed).state()) for seed in range(count)]
+    return [network(seed).exact() for seed in range(count)]
 
 
 def drawn(*shape, seed=0, spread=2.0):
@@ -89,7 +90,7 @@ def kilobytes(name):
     return int(Path("/proc/self/status").read_text().split(name)[1].split()[0])
 
 torch.set_num_threads(3)
-networks = [SpatialAr.exact(SpatialAr(torch.Generator().manual_seed(seed)).state()) for seed in range(3)]
+networks = [SpatialAr(torch.Generator().manual_seed(seed)).exact() for seed in range(3)]
 one = PlaneCoder().decode(Path(sys.argv[2]).read_bytes(), PlaneContext(networks, [(1, 4, 4)]))  # the kernel is loaded
 data = Path(sys.argv[1]).read_bytes()
 before = kilobytes("VmRSS:")
@@ -102,7 +103,7 @@ print((kilobytes("VmHWM:") - before) * 1024)
 def test_planes_of_one_channel_take_no_more_than_their_size_allows(tmp_path):
     if not EXACT.try_load():
         pytest.skip("no compiler: nothing is decoded side by side")
-    networks = [SpatialAr.exact(SpatialAr(torch.Generator().manual_seed(seed)).state()) for seed in range(3)]
+    networks = [SpatialAr(torch.Generator().manual_seed(seed)).exact() for seed in range(3)]
     for name, size in (("large", 700), ("small", 4)):
         (tmp_path / name).write_bytes(plane_lists.encode([np.zeros((3, 1, size, size), np.int64)], networks))
     command = [sys.executable, "-c", MEMORY, str(tmp_path / "large"), str(tmp_path / "small")]
@@ -131,17 +132,17 @@ def test_levels_are_the_tables_nearest_to_the_scale():
         for shift in (0.95, 1.0, 1.05):
             with torch.no_grad():
                 made.layers[-1].bias[1] = -2 * np.log(levels[level] * shift)
-            _, found = SpatialAr.exact(made.state())(torch.zeros(1, 12, dtype=torch.int64))
+            _, found = made.exact()(torch.zeros(1, 12, dtype=torch.int64))
             assert found.tolist() == [level]
     for s, level in ((1e3, 0), (-1e3, 63)):
         with torch.no_grad():
             made.layers[-1].bias[1] = s
-        assert SpatialAr.exact(made.state())(torch.zeros(1, 12, dtype=torch.int64))[1].tolist() == [level]
+        assert made.exact()(torch.zeros(1, 12, dtype=torch.int64))[1].tolist() == [level]
 
 
 def test_the_estimate_is_what_is_coded():
     made = [network(seed, scale=0.3) for seed in range(3)]
-    networks = [SpatialAr.exact(each.state()) for each in made]
+    networks = [each.exact() for each in made]
     planes = drawn(3, 10, 60, 60, spread=1.5)
     size = 8 * len(plane_lists.encode([planes], networks))
     tables = plane_lists.table_bits([planes], networks)
@@ -155,17 +156,16 @@ def test_damage_is_refused():
     data = plane_lists.encode(planes, networks)
     check_damage(data, lambda d: plane_lists.decode(d, [(2, 4, 5)], networks)[0], planes[0], masks=(0x01, 0x80))
     with pytest.raises(BitstreamError):
-        plane_lists.decode(data, [(2, 4, 5)], [SpatialAr.exact(network(7, scale=5).state())])
+        plane_lists.decode(data, [(2, 4, 5)], [network(7, scale=5).exact()])
 
 
 def test_weights_that_make_no_network_are_refused():
-    state = network().state()
-    for name, value in (("weight0", np.zeros((16, 11), np.float32)), ("bias4", np.float32([np.inf, 0])),
-                        ("weight2", np.full((16, 16), 1e6, np.float32))):  # fmt: skip
+    for layer, name, value in ((4, "bias", math.inf), (2, "weight", 1e6)):
+        made = network()
+        with torch.no_grad():
+            getattr(made.layers[layer], name).fill_(value)
         with pytest.raises(BitstreamError):
-            SpatialAr.exact({**state, name: value})
-    with pytest.raises(BitstreamError):
-        SpatialAr.exact({})
+            made.exact()
 
 
 def test_it_learns_a_smooth_ramp():

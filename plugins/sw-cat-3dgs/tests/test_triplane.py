@@ -5,9 +5,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from splatwizard_core.errors import BitstreamError
 from sw_cat_3dgs.outliers import inliers, local_outlier_factor
-from sw_cat_3dgs.principal_frame import UNIT, PrincipalFrame, contract
+from sw_cat_3dgs.principal_frame import FAR, UNIT, PrincipalFrame, contract
 from sw_cat_3dgs.triplane import Triplane
 
 
@@ -47,7 +46,7 @@ def test_far_points_are_left_out():
 def test_a_similarity_of_the_cloud_leaves_its_coordinates_up_to_signs():
     points = cloud()
     turned = 0.01 * points @ Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix().T + [100, 3, -7]
-    a, b = (PrincipalFrame.fit(each).coordinates(each) for each in (points, turned))
+    a, b = (coordinates(PrincipalFrame.fit(each), each) for each in (points, turned))
     for axis in range(3):
         assert min(np.abs(a[:, axis] - b[:, axis]).max(), np.abs(a[:, axis] + b[:, axis]).max()) < 1e-2
 
@@ -68,7 +67,7 @@ def test_integer_places_are_those_of_the_float_formula(shape):
     frame = PrincipalFrame.fit(shape)
     codes, low, step = lattice(np.concatenate([shape, outliers]))
     places = frame.unit(codes, low, step)
-    expected = frame.coordinates(codes.numpy() * step.astype(np.float64) + low).clip(-1, 1)
+    expected = coordinates(frame, codes.numpy() * step.astype(np.float64) + low).clip(-1, 1)
     width = frame.high - frame.low
     exact = places.numpy() / (UNIT / 2) - 1
     # Where the cloud has no width, only the side counts.
@@ -88,24 +87,26 @@ def test_places_do_not_depend_on_the_batch():
 
 
 def test_a_frame_survives_its_file_and_nonsense_does_not():
-    frame = PrincipalFrame.fit(cloud())
-    again = PrincipalFrame.from_state(frame.state())
-    assert all(np.array_equal(frame.state()[k], again.state()[k]) for k in frame.state())
+    rows = PrincipalFrame.fit(cloud()).rows()
+    assert rows.dtype == np.float32
+    assert np.array_equal(PrincipalFrame.from_rows(rows).rows(), rows)
     codes, low, step = lattice(cloud())
-    for name, value in (
-        ("std", np.zeros(3)),
-        ("std", np.full(3, 1e-38)),
-        ("mean", np.full(3, 1e38)),
-        ("high", [1e20] * 3),
-    ):
-        odd = PrincipalFrame.from_state({**frame.state(), name: np.asarray(value, np.float32)})
+    for row, value in ((4, 0), (4, 1e-38), (0, 1e38), (6, 1e20)):
+        odd = rows.copy()
+        odd[row] = value
         with pytest.raises(ValueError, match="damaged or hostile"):
-            odd.unit(codes, low, step)
-    for name, value in (("std", [1, np.nan, 1]), ("axes", np.zeros(3)), ("mean", np.zeros(3, np.float64))):
-        with pytest.raises(BitstreamError, match=name):
-            PrincipalFrame.from_state(
-                {**frame.state(), name: np.asarray(value, None if name == "mean" else np.float32)}
-            )
+            PrincipalFrame.from_rows(odd).unit(codes, low, step)
+
+
+def coordinates(frame, points):
+    """[N,3] float64, -1 .. 1 inside the box and more outside: what `unit` computes exactly, in plain floats."""
+    mean, axes, std, low, high = (each.astype(np.float64) for each in vars(frame).values())
+    place = contract(((points - mean) @ axes / std).clip(-FAR, FAR)) / 4 + 0.5
+    return 2 * (place - low) / np.maximum(high - low, 2.0**-18) - 1
+
+
+def exact_features(integers, places):
+    return Triplane.exact_lookup(integers)(places)
 
 
 def triplane(resolution=5, channels=3, multiples=(1, 2), scale=200.0):
@@ -141,12 +142,12 @@ def test_integers_give_the_features_of_the_floats(resolution):
     made = triplane(resolution)
     places = torch.randint(0, UNIT + 1, (500, 3), generator=torch.Generator().manual_seed(1))
     places = torch.cat([places, torch.tensor([[0, 0, 0], [UNIT] * 3])])
-    exact = made.exact(made.integers(), places)
+    exact = exact_features(made.integers(), places)
     assert exact.dtype == torch.int64
     # Twelve bits of weight an axis, and one unit lost by the floor.
     assert (exact / 4096 - made(places)).abs().max() < 5e-3
-    assert torch.equal(exact[:7], made.exact(made.integers(), places[:7]))
-    assert torch.equal(exact[-1:], made.exact(made.integers(), places[-1:]))
+    assert torch.equal(exact[:7], exact_features(made.integers(), places[:7]))
+    assert torch.equal(exact[-1:], exact_features(made.integers(), places[-1:]))
 
 
 def test_gradients_reach_the_planes_through_the_rounding():
@@ -167,5 +168,7 @@ def test_places_and_features_are_the_same_integers_on_cuda():
     places = frame.unit(codes, low, step)
     assert torch.equal(frame.unit(codes.cuda(), low, step).cpu(), places)
     integers = made.integers()
-    assert torch.equal(made.exact([i.cuda() for i in integers], places.cuda()).cpu(), made.exact(integers, places))
+    assert torch.equal(
+        exact_features([i.cuda() for i in integers], places.cuda()).cpu(), exact_features(integers, places)
+    )
     assert (made.cuda()(places.cuda()).cpu() - made.cpu()(places)).abs().max() < 1e-4

@@ -5,12 +5,10 @@ The float form is trained. `places` are integers in training and file alike: bot
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from sw_anchors.anchors import linear_layers
 from sw_anchors.lattice import low_and_step
@@ -32,7 +30,6 @@ from sw_codecs.quantizers.rounding import add_noise
 STEP_OFFSET = 1.1
 """A step is its base times (1.1 + tanh t): never zero."""
 PLANES = 3
-FRAME_ROWS = {"mean": slice(0, 1), "axes": slice(1, 4), "std": slice(4, 5), "low": slice(5, 6), "high": slice(6, 7)}
 
 
 @dataclass(frozen=True)
@@ -58,7 +55,7 @@ class ContextShape(AnchorShape):
 class CatContext(nn.Module):
     """Context model of all anchors.
 
-    frame       [7,3] buffer: constants of the triplane's frame; zeros until `fit_frame`
+    frame       [7,3] buffer: `PrincipalFrame.rows` of the triplane's frame; zeros until `fit_frame`
     triplane    planes of resolution 0 until the stage sets them up
     network     feature of a place -> means, scales, step logits
     slices      refine each slice of the features by those before it
@@ -99,23 +96,20 @@ class CatContext(nn.Module):
 
     def exact_arms(self) -> list[ExactSpatialAr]:
         """The spatial models in integers. Raises BitstreamError for weights that no exact evaluation takes."""
-        return [arm.exact(arm.state()) for arm in self.spatial_models]
+        return [arm.exact() for arm in self.spatial_models]
 
     # Set-up
 
     def fit_frame(self, positions: Tensor, *, neighbors: int = 50, contamination: float = 0.05) -> None:
         """Lay the axes through the anchors [N,3] of now, N > 0."""
         xyz = positions.detach().cpu().numpy()
-        state = PrincipalFrame.fit(xyz, neighbors=neighbors, contamination=contamination).state()
-        rows = np.concatenate([np.atleast_2d(state[name]) for name in FRAME_ROWS])
-        self.frame = torch.from_numpy(rows.astype(np.float32)).to(self.frame)
+        frame = PrincipalFrame.fit(xyz, neighbors=neighbors, contamination=contamination)
+        self.frame = torch.from_numpy(frame.rows()).to(self.frame)
 
     def places(self, codes: Tensor, bounds: Tensor) -> Tensor:
         """Integer places [N,3] of position codes on the lattice `bounds`. Raises ValueError for a senseless frame."""
-        rows = self.frame.detach().cpu().numpy()
-        state = {name: rows[part] if name == "axes" else rows[part][0] for name, part in FRAME_ROWS.items()}
         low, step = low_and_step(bounds.detach().cpu())
-        return PrincipalFrame.from_state(state).unit(codes, low.numpy(), step.numpy())
+        return PrincipalFrame.from_rows(self.frame.cpu().numpy()).unit(codes, low.numpy(), step.numpy())
 
     @torch.no_grad()
     def start_at(self, values: tuple[Tensor, Tensor, Tensor]) -> None:
@@ -173,11 +167,6 @@ class CatContext(nn.Module):
         steps = (STEP_OFFSET + torch.tanh(out[6])) * out[6].new_tensor(self.shape.base_steps)  # [V,3]
         means, scales = ([out[2 * i + second] * unit for i, unit in enumerate(self.units)] for second in (0, 1))
         return AnchorContext(triple(means), triple(scales), triple(steps.split(1, dim=1)))
-
-    def refine(self, context: AnchorContext, features: Tensor) -> AnchorContext:
-        """Refine the context by features [V,F]: each slice by those before it."""
-        means, scales = self.refined(context.means, context.scales, features)
-        return dataclasses.replace(context, means=means, scales=scales)
 
     def refined(self, means: Sequence[Tensor], scales: Sequence[Tensor], features: Tensor) -> tuple[Triple, Triple]:
         """Refine means and scales of the groups by features [V,F]."""

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import torch
 from sw_anchors.coded_anchors import CodedAnchors
-from sw_anchors.rate_model import AnchorContext, Context
+from sw_anchors.rate_model import Context
 from torch import Tensor
 
 from splatwizard_core.api import Camera, Rasterizer
@@ -65,10 +65,6 @@ class CatAnchors(CodedAnchors):
         if kept is None or kept[0][0] is not codes or kept[0][1] is not frame or kept[0][2] != key[2]:
             kept = self._places = (key, self.context.places(codes, self.bounds))
         return kept[1]
-
-    def predict(self, rows: Tensor) -> AnchorContext:
-        found: AnchorContext = self.context(self.places()[rows])
-        return found
 
     def context_rows(self) -> Context:
         """The places of the anchors in the triplane; their sites on the planes, where `fast` takes these."""

@@ -8,14 +8,12 @@ that of mip-NeRF 360 (arXiv 2111.12077).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from splatwizard_core.api import BitstreamError
 from sw_cat_3dgs.outliers import inliers
 
 UNIT = 1 << 20
@@ -64,12 +62,6 @@ class PrincipalFrame:
         constants = (mean, axes, std, place.min(axis=0), place.max(axis=0))
         return cls(*(np.ascontiguousarray(each, np.float32) for each in constants))
 
-    def coordinates(self, points: np.ndarray) -> np.ndarray:
-        """[N,3] float64, -1 .. 1 inside the box and more outside: what `unit` computes exactly, in plain floats."""
-        mean, axes, std, low, high = (getattr(self, f.name).astype(np.float64) for f in fields(self))
-        place = _place((np.asarray(points, np.float64) - mean) @ axes / std)
-        return 2 * (place - low) / np.maximum(high - low, 2.0**-18) - 1
-
     def unit(self, codes: Tensor, low: np.ndarray, step: np.ndarray) -> Tensor:
         """Places of the points low + code * step: int64 [N,3] in 0 .. UNIT; what lies outside the box is on its side.
 
@@ -115,19 +107,14 @@ class PrincipalFrame:
             rows.append([*(int(v) for v in np.rint(np.append(row, constant) * 2.0 ** (_FRACTION + extra))), extra])
         return rows, *(each.astype(np.int64).tolist() for each in (box[0], np.maximum(box[1] - box[0], 1)))
 
-    def state(self) -> dict[str, np.ndarray]:
-        """The float32 arrays that go into the file."""
-        return {f.name: getattr(self, f.name) for f in fields(self)}
+    def rows(self) -> np.ndarray:
+        """float32 [7,3], what the file has: mean, the rows of the axes, std, low, high."""
+        return np.concatenate([np.atleast_2d(getattr(self, f.name)) for f in fields(self)])
 
     @classmethod
-    def from_state(cls, state: Mapping[str, np.ndarray]) -> PrincipalFrame:
-        """From what `state` gave. Raises BitstreamError if it is something else."""
-        for f in fields(cls):
-            array = state.get(f.name)
-            shape = (3, 3) if f.name == "axes" else (3,)
-            if array is None or array.shape != shape or array.dtype != np.float32 or not np.isfinite(array).all():
-                raise BitstreamError(f"the frame of the triplane lacks a finite float32 '{f.name}' {list(shape)}")
-        return cls(**{f.name: state[f.name] for f in fields(cls)})
+    def from_rows(cls, rows: np.ndarray) -> PrincipalFrame:
+        """Inverse of `rows`."""
+        return cls(rows[0], rows[1:4], *rows[4:])
 
 
 def _place(y: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ Source: CAT-3DGS (arXiv 2503.00357), after Cool-Chic (arXiv 2212.05458).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -42,7 +42,7 @@ class SpatialAr(nn.Module):
         super().__init__()
         sizes = [(len(NEIGHBORS), HIDDEN), *[(HIDDEN, HIDDEN)] * RESIDUALS, (HIDDEN, 2)]
         self.layers = nn.ModuleList(UnsetLinear(*size) for size in sizes)
-        for i, layer in enumerate(self._linear()):
+        for i, layer in enumerate(self.linear()):
             for parameter in layer.parameters():
                 nn.init.zeros_(parameter)
             if i in (0, len(self.layers) - 1):
@@ -50,7 +50,8 @@ class SpatialAr(nn.Module):
                 with torch.no_grad():
                     layer.weight.copy_(drawn / layer.out_features**2)
 
-    def _linear(self) -> list[nn.Linear]:
+    def linear(self) -> list[nn.Linear]:
+        """The layers in order."""
         return [layer for layer in self.layers if isinstance(layer, nn.Linear)]
 
     def forward(self, planes: Tensor) -> tuple[Tensor, Tensor]:
@@ -60,7 +61,7 @@ class SpatialAr(nn.Module):
         around = [padded[:, 2 + down : 2 + down + h, 2 + right : 2 + right + w] for down, right in NEIGHBORS]
         a = torch.stack([each.flatten() for each in around])  # [12, n]: one column a value, so weights come first
         last = len(self.layers) - 1
-        for i, layer in enumerate(self._linear()):
+        for i, layer in enumerate(self.linear()):
             out = torch.addmm(layer.bias[:, None], layer.weight, a)
             a = out if i == last else torch.relu(out + a if i > 0 else out)
         mean, s = a.view(2, *planes.shape)
@@ -76,18 +77,9 @@ class SpatialAr(nn.Module):
         s = -lower_bound(-s, 2 * math.log(SMALLEST))
         return laplace_bits(planes, mean, torch.exp(-0.5 * s), p_min=P_MIN)
 
-    def state(self) -> dict[str, np.ndarray]:
-        """The float32 arrays that go into the file: weight0, bias0, ..."""
-        return {
-            f"{kind}{i}": getattr(layer, kind).detach().cpu().numpy().astype(np.float32)
-            for i, layer in enumerate(self.layers)
-            for kind in ("weight", "bias")
-        }
-
-    @staticmethod
-    def exact(state: Mapping[str, np.ndarray]) -> ExactSpatialAr:
-        """The integer form of what `state` gave. Raises BitstreamError if the arrays make no such network."""
-        return ExactSpatialAr(state)
+    def exact(self) -> ExactSpatialAr:
+        """The integer form, for the file. Raises BitstreamError for weights that have none."""
+        return ExactSpatialAr(self)
 
 
 def plane_bits(networks: Sequence[SpatialAr], planes: Sequence[Tensor]) -> Tensor:
@@ -99,15 +91,12 @@ def plane_bits(networks: Sequence[SpatialAr], planes: Sequence[Tensor]) -> Tenso
 class ExactSpatialAr:
     """The network of a file in integers: means and table levels do not depend on device or batch."""
 
-    def __init__(self, state: Mapping[str, np.ndarray]) -> None:
-        sizes = [(HIDDEN, len(NEIGHBORS)), *[(HIDDEN, HIDDEN)] * RESIDUALS, (2, HIDDEN)]
+    def __init__(self, network: SpatialAr) -> None:
         weights = []
-        for i, size in enumerate(sizes):
-            weight, bias = state.get(f"weight{i}"), state.get(f"bias{i}")
-            if weight is None or bias is None or weight.shape != size or bias.shape != size[:1]:
-                raise BitstreamError(f"layer {i} of a spatial model must be {list(size)} with as many biases")
+        for i, layer in enumerate(network.linear()):
+            weight, bias = (each.detach().cpu().numpy() for each in (layer.weight, layer.bias))
             skip = np.eye(HIDDEN, dtype=np.float32) if 0 < i <= RESIDUALS else np.float32(0)
-            weights.append((weight.astype(np.float32) + skip, bias))  # the identity skip is part of the layer
+            weights.append((weight + skip, bias))  # the identity skip is part of the layer
         try:
             self._network = IntegerMlp(weights)
         except ValueError as error:

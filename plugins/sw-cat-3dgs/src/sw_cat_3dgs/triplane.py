@@ -8,13 +8,12 @@ mode of the codec library, rules 1 and 2.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import grid_sample
 
-from sw_cat_3dgs.principal_frame import UNIT, PrincipalFrame
+from sw_cat_3dgs.principal_frame import UNIT
 from sw_codecs.exact_native import EXACT
 from sw_codecs.quantizers.straight_through import straight_through
 
@@ -23,7 +22,6 @@ PAIRS = ((0, 1), (0, 2), (1, 2))
 GAIN = 16
 """Integers of the file are round(GAIN * value)."""
 INTEGER_LIMIT = 1 << 24
-ROWS_AT_ONCE = 1 << 13
 MOST_SCALES = 4
 """That the kernel of the exact look-up takes."""
 
@@ -37,8 +35,6 @@ class Triplane(nn.Module):
     A model that makes its planes while it trains starts with resolution 0 and replaces `planes.0`, `planes.1`, ... by
     what `initial` draws.
     """
-
-    Frame: ClassVar[type[PrincipalFrame]] = PrincipalFrame
 
     def __init__(
         self,
@@ -63,7 +59,7 @@ class Triplane(nn.Module):
         return 3 * self.channels * len(self.multiples)
 
     def forward(self, places: Tensor, *, rounded: bool = True) -> Tensor:
-        """Features [n, width] at places int64 [n,3] in 0 .. UNIT (`Frame.unit`).
+        """Features [n, width] at places int64 [n,3] in 0 .. UNIT (`PrincipalFrame.unit`).
 
         rounded     planes as the file will have them; the gradient passes straight through the rounding
         """
@@ -88,17 +84,12 @@ class Triplane(nn.Module):
         return found
 
     @staticmethod
-    def exact(integers: Sequence[Tensor], places: Tensor) -> Tensor:
-        """Features int64 [n, width] with 12 fractional bits, from `integers` and places as above.
-
-        The result does not depend on device or batch: integers alone. Values stay below 2^24.
-        """
-        lookup = Triplane.exact_lookup(integers)
-        return torch.cat([lookup(block) for block in places.split(ROWS_AT_ONCE)])
-
-    @staticmethod
     def exact_lookup(integers: Sequence[Tensor]) -> Callable[[Tensor], Tensor]:
-        """`exact` of one set of planes, as a function of places: to be called often, with few places at once."""
+        """Features int64 [n, width] with 12 fractional bits, from `integers`, as a function of places.
+
+        To be called often, with few places at once. The result does not depend on device or batch: integers alone.
+        Values stay below 2^24.
+        """
         corners = [plane.flatten(2).transpose(1, 2).contiguous() for plane in integers]  # [3, R*R, C]
         if _kernel_takes(corners) and EXACT.try_load():
             small = [each.to(torch.int32) for each in corners]
