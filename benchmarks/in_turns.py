@@ -72,7 +72,7 @@ def start(name: str, folders: str, options: list[str], folder: Path) -> Version:
     environment = {
         **os.environ, "PYTHONPATH": ":".join(paths), "SPLATWIZARD_CACHE": f"{paths[0]}.cache", REPORT: str(theirs),
     }  # fmt: skip
-    command = [sys.executable, __file__, "train", "--method", "3dgs", *options, "--out", str(folder / name)]
+    command = [sys.executable, __file__, "train", *options, "--out", str(folder / name)]
     with log.open("wb") as file:
         process = subprocess.Popen(
             command, env=environment, stdout=file, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, pass_fds=[theirs]
@@ -115,7 +115,7 @@ def train_in_slices() -> None:
 
 def compare(versions: dict[str, str], args: argparse.Namespace, seed: int) -> dict[str, Version]:
     """Train each once with this seed, in turns."""
-    options = ["--scene", args.scene, "--preset", args.preset, "--device", args.device, "--seed", str(seed)]
+    options = ["--method", args.method, "--scene", args.scene, "--preset", args.preset, "--device", args.device, "--seed", str(seed)]
     options += [part for assignment in args.set for part in ("--set", assignment)]
     options += ["--set", "checkpoint_every=1000000000"]
     with tempfile.TemporaryDirectory() as folder:
@@ -138,6 +138,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("versions", nargs="+", metavar="NAME=FOLDER", help="the first is what others are compared with")
     parser.add_argument("--scene", required=True)
+    parser.add_argument("--method", default="3dgs", help="(default: 3dgs)")
     parser.add_argument("--preset", default="paper")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--seeds", default="0", help="comma list (default: 0)")
@@ -150,7 +151,7 @@ def main() -> None:
         if not name or not equals or not all(Path(folder).is_dir() for folder in folders.split(":")) or "/" in name:
             parser.error(f"'{text}' is not NAME=FOLDER with folders that exist")
         versions[name] = folders
-    print(f"{args.scene}, preset {args.preset}, turns of {args.slice:g} s", flush=True)
+    print(f"{args.method}, {args.scene}, preset {args.preset}, turns of {args.slice:g} s", flush=True)
     for seed in map(int, args.seeds.split(",")):
         found = compare(versions, args, seed)
         base = next(iter(found.values())).seconds

@@ -28,6 +28,7 @@ from scene import make_arrays, orbit_cameras
 from sw_gaussians.stage import ThreeDGSStage
 from torch.profiler import ProfilerActivity, profile
 
+from splatwizard_core.base.rng import Streams
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins.manager import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
@@ -35,7 +36,6 @@ from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.scene.images import keep_pictures
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
 from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.rng import Streams
 from splatwizard_core.training.stage import StageContext
 from splatwizard_core.training.state import TrainingState
 from splatwizard_core.training.trainer import Trainer

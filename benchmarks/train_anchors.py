@@ -50,6 +50,7 @@ from step_parts import SECTION, kernel_times, longest_kernels, report
 from sw_anchors.fast import networks, replay, rows, sample_bits
 from torch.profiler import ProfilerActivity, profile, record_function
 
+from splatwizard_core.base.rng import Streams
 from splatwizard_core.gaussians.inputs import rgb_to_dc
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins.manager import load_plugins
@@ -61,10 +62,9 @@ from splatwizard_core.runs.session import Session
 from splatwizard_core.scene.images import decode_all, keep_pictures
 from splatwizard_core.scene.scene import Scene
 from splatwizard_core.streams import stream
-from splatwizard_core.training.rng import Streams
 from splatwizard_core.training.stage import StageContext
 from splatwizard_core.training.state import TrainingState
-from splatwizard_core.training.trainer import StepRecord, Trainer
+from splatwizard_core.training.trainer import Trainer
 from splatwizard_native import seeded, work_time
 from sw_cat_3dgs.fast import plane_kernels, plane_sites
 
@@ -172,7 +172,7 @@ class Watch:
     def begin(self) -> None:
         self._since = self._now()
 
-    def __call__(self, record: StepRecord) -> None:
+    def __call__(self, record: TrainingState) -> None:
         step = record.step
         self.losses.append(record.total)
         phase = next((p for p in self.phases if p.start < step <= p.end), None)
@@ -195,7 +195,7 @@ class Watch:
             self._now()
             self._profile.__exit__(None, None, None)
             if not self.brief:
-                phase.lines = report(self._profile, length, cuda=self.device.type == "cuda", rows=record.num_rows)
+                phase.lines = report(self._profile, length, cuda=self.device.type == "cuda", rows=record.model.num_rows)
             phase.busy = sum(t for t, _ in kernel_times(self._profile).values()) / length
             phase.lines += longest_kernels(self._profile, length, self.kernels)
             self._profile = None
@@ -238,7 +238,7 @@ def mark_parts(trainer: Trainer) -> None:
     """Name the parts of a step for the profiler."""
     for path, name in PARTS.items():
         *owners, leaf = path.split(".")
-        owner: Any = trainer
+        owner: Any = trainer.state
         for each in owners:
             owner = getattr(owner, each, None)
         if owner is not None and hasattr(owner, leaf):
@@ -398,7 +398,7 @@ def explicit(
     trainer = trainer_of(make_method(session.plugins, resolved).stages()[0], splats, scene, resolved.ppl, rasterizer)
     clock: dict[int, float] = {}
 
-    def after(record: StepRecord) -> None:
+    def after(record: TrainingState) -> None:
         if record.step in (steps // 5, steps):
             if session.device.type == "cuda":
                 torch.cuda.synchronize()

@@ -5,10 +5,11 @@ from __future__ import annotations
 import subprocess
 
 import pytest
+from sw_doctor.building import resolve_module
 from sw_doctor.declared_modules import declared_modules
 
 from splatwizard_core.plugins import load_plugins
-from splatwizard_native import find_nvcc, resolve_module, toolchain
+from splatwizard_native import find_nvcc, toolchain
 
 MODULES = [resolve_module(target) for target in declared_modules(load_plugins())]
 SOURCES = [(module, source) for module in MODULES for source in module.cuda_sources if source.endswith(".cu")]

@@ -3,8 +3,7 @@
 import sys
 
 from native_package import call, needs_compiler
-
-from splatwizard_native import build_all, cuda_toolkit
+from sw_doctor.building import build_all
 
 
 @needs_compiler
@@ -33,7 +32,7 @@ def test_build_all_builds_every_target_and_reports_what_fails(package):
 
 
 def test_build_all_for_cuda_fails_where_it_would_leave_kernels_out(package, monkeypatch):
-    monkeypatch.setattr(cuda_toolkit, "mismatch", lambda: "there is none")
+    monkeypatch.setattr("sw_doctor.building.toolkit_mismatch", lambda: "there is none")
     monkeypatch.setenv("CXX", sys.executable)  # there, and not called
     package.write(
         "native.py",

@@ -15,7 +15,8 @@ pytestmark = pytest.mark.skipif(os.name != "posix", reason="processes in groups,
 BUILD = """
 import signal, sys
 signal.signal(signal.SIGTERM, signal.default_int_handler)  # as `sw` has it
-from splatwizard_native import NativeModule, build_all
+from splatwizard_native import NativeModule
+from sw_doctor.building import build_all
 {call}
 """
 MODULE = "NativeModule('slow', {package!r}, ('answer.cpp', 'second.cpp')).build()"

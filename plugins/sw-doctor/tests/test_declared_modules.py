@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from sw_doctor.building import resolve_module
 from sw_doctor.declared_modules import CORE_MODULES, declared_modules
 
 from splatwizard_core.plugins.manager import PluginManager
-from splatwizard_native import NativeModule, resolve_module
+from splatwizard_native import NativeModule
 
 
 def test_modules_of_entries_come_after_the_cores_each_once():

@@ -411,6 +411,7 @@ def test_a_wide_grid_is_looked_up_a_few_anchors_at_a_time(mode, monkeypatch):
     limit = 20 * grid.corners
     for where, name in (
         ("sw_anchors.attribute_sections", "EXACT_NUMBERS"),
+        ("sw_anchors.fast.exact_lattice", "EXACT_NUMBERS"),
         ("sw_hac.rate_model", "FLOAT_NUMBERS"),
     ):
         monkeypatch.setattr(f"{where}.{name}", limit)

@@ -6,6 +6,7 @@ import weakref
 import pytest
 import torch
 
+from splatwizard_core.base.rng import Streams
 from splatwizard_core.errors import TaskError, TrainingDiverged
 from splatwizard_core.evaluation.evaluate import render_view
 from splatwizard_core.gaussians.model import GaussianModel
@@ -17,7 +18,6 @@ from splatwizard_core.training import trainer as trainer_module
 from splatwizard_core.training.losses import LossPack
 from splatwizard_core.training.optimizer import SplatOptimizer
 from splatwizard_core.training.params import OptimizationParams, PipelineParams
-from splatwizard_core.training.rng import Streams
 from splatwizard_core.training.state import TrainingState
 from splatwizard_core.training.trainer import CHECK_EVERY, Trainer
 from splatwizard_native import DeviceMemoryError, Verdict, read_scalars

@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from splatwizard_core.base.rng import Streams
 from splatwizard_core.errors import (
     ConfigError,
     EmptyModel,
@@ -23,7 +24,6 @@ from splatwizard_core.training.losses import LossPack
 from splatwizard_core.training.optimizer import SplatOptimizer
 from splatwizard_core.training.params import OptimizationParams, PipelineParams
 from splatwizard_core.training.pipeline import TrainingRun
-from splatwizard_core.training.rng import Streams
 from splatwizard_core.training.scheduler import STOP
 from splatwizard_core.training.state import TrainingState
 from splatwizard_core.training.trainer import Trainer

@@ -18,13 +18,11 @@ from splatwizard_native.errors import shortened as shortened
 from splatwizard_native.lending import lend as lend
 
 if TYPE_CHECKING:
-    from splatwizard_native.build import BuildRow as BuildRow
-    from splatwizard_native.build import build_all as build_all
-    from splatwizard_native.build import resolve_module as resolve_module
     from splatwizard_native.core_time import CoreTime as CoreTime
     from splatwizard_native.cores import available_cores as available_cores
     from splatwizard_native.cuda_toolkit import find_nvcc as find_nvcc
     from splatwizard_native.cuda_toolkit import nvcc_version as nvcc_version
+    from splatwizard_native.cuda_toolkit import toolkit_mismatch as toolkit_mismatch
     from splatwizard_native.files import TEMPORARY as TEMPORARY
     from splatwizard_native.files import bytes_with_named as bytes_with_named
     from splatwizard_native.files import file_sha256 as file_sha256
@@ -67,16 +65,16 @@ if TYPE_CHECKING:
     from splatwizard_native.strict_json import dump_strict as dump_strict
     from splatwizard_native.strict_json import json_reason as json_reason
     from splatwizard_native.strict_json import load_strict as load_strict
+    from splatwizard_native.toolchain import Toolchain as Toolchain
     from splatwizard_native.toolchain import find_compiler as find_compiler
     from splatwizard_native.work_clock import loading_time as loading_time
     from splatwizard_native.work_clock import work_time as work_time
 
 # Imported on first use: who only catches the errors, as every command does, need not wait for the rest.
 MODULES = {
-    "build": "BuildRow build_all resolve_module",
     "core_time": "CoreTime",
     "cores": "available_cores",
-    "cuda_toolkit": "find_nvcc nvcc_version",
+    "cuda_toolkit": "find_nvcc nvcc_version toolkit_mismatch",
     "errors": (
         "FULL CompilerMissingError DeviceMemoryError DiskFullError ForeseenError NativeBuildError out_of_memory "
         "shortened"
@@ -99,7 +97,7 @@ MODULES = {
     "scalars": "Verdict read_scalars",
     "settings": "cache_root fast_enabled",
     "strict_json": "dump_strict json_reason load_strict",
-    "toolchain": "find_compiler",
+    "toolchain": "Toolchain find_compiler",
     "work_clock": "loading_time work_time",
 }
 """Module -> the names that are offered here."""

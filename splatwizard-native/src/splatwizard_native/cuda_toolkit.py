@@ -41,7 +41,7 @@ def root_of(nvcc: str) -> Path:
     return next((home for home in homes if (home / "include" / "cuda_runtime.h").is_file()), beside)
 
 
-def mismatch() -> str | None:
+def toolkit_mismatch() -> str | None:
     """The reason why CUDA kernels for this torch cannot be compiled here, or None."""
     import torch
 

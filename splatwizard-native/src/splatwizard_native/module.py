@@ -301,7 +301,7 @@ class NativeModule:
         """The reason why a build here holds no CUDA kernels, or None."""
         if not self.cuda_sources:
             return f"module '{self.name}' has no CUDA kernels"
-        return cuda_toolkit.mismatch()
+        return cuda_toolkit.toolkit_mismatch()
 
     def _jobs(self, march: str, objects: Path) -> list[Job]:
         root, cuda = self._root(), self._with_cuda()

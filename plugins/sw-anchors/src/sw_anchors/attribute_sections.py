@@ -15,12 +15,12 @@ import torch
 from torch import Tensor, nn
 
 from splatwizard_core.api import BitstreamError
+from sw_anchors.fast import exact_lattice
 from sw_anchors.row_parts import EXACT_NUMBERS, parts_of
 from sw_anchors.shape import GROUPS, AnchorShape
 from sw_codecs.context.integer_mlp import FRACTION, IntegerMlp
-from sw_codecs.entropy.exact_tables import exact_tables, step_multipliers
+from sw_codecs.entropy.exact_tables import step_multipliers
 from sw_codecs.entropy.rows import RowContext, RowLattice
-from sw_codecs.exact_native import EXACT
 from sw_codecs.quantizers.rounding import SteRound
 
 if TYPE_CHECKING:
@@ -172,32 +172,16 @@ class ExactNetwork:
         Raises ValueError if the network cannot be evaluated exactly.
         """
         units = [1 / base for base, width in zip(base_steps, shape.widths, strict=True) for _ in range(2 * width)]
-        self._network = IntegerMlp.from_module(
+        self.network = IntegerMlp.from_module(
             network, output_scale=np.array([*units, *[1.0] * (len(GROUPS) + further)])
         )
-        self._shape, self._base_steps, self._step_offset = shape, tuple(base_steps), step_offset
+        self.shape, self._base_steps, self.step_offset = shape, tuple(base_steps), step_offset
 
     def on_lattice(
         self, places: Tensor, features: Callable[[Tensor], Tensor], width: int
     ) -> Mapping[str, RowContext | RowLattice]:
         """Distributions as of a call, put on the lattice of the coder at once where there is a kernel."""
-        if not EXACT.try_load():
-            return self(places, features, width)
-        n, columns = len(places), self._shape.widths
-        centre = [torch.empty(n, c, dtype=torch.int32) for c in columns]
-        number = [torch.empty(n, c, dtype=torch.int16) for c in columns]
-        steps = torch.empty(n, len(columns), dtype=torch.int64)
-        multipliers = torch.from_numpy(exact_tables().multipliers + self._step_offset)
-        thresholds, start, fine = torch.from_numpy(exact_tables().thresholds), 0, True
-        for part in parts_of(places, width, EXACT_NUMBERS) if n else ():
-            at = slice(start, start + len(part))
-            fine = fine and self._network.forecast(
-                features(part), multipliers, thresholds, [c[at] for c in centre], [c[at] for c in number], steps[at]
-            )
-            start += len(part)
-        if not fine:  # out of range: whoever codes the numbers says so
-            return self(places, features, width)
-        return {group: RowLattice(centre[i], number[i], steps[:, i : i + 1]) for i, group in enumerate(GROUPS)}
+        return exact_lattice.on_lattice(self, places, features, width) or self(places, features, width)
 
     def __call__(self, places: Tensor, features: Callable[[Tensor], Tensor], width: int) -> dict[str, RowContext]:
         """Distributions by group for anchors at `places` [n, ...].
@@ -209,17 +193,17 @@ class ExactNetwork:
 
     def outputs(self, places: Tensor, features: Callable[[Tensor], Tensor], width: int) -> Tensor:
         """Outputs of the network, int64 [n, sum(shape.outputs) + further]; arguments as of a call."""
-        outputs = torch.empty(len(places), self._network.outputs, dtype=torch.int64)
+        outputs = torch.empty(len(places), self.network.outputs, dtype=torch.int64)
         start = 0
         for part in parts_of(places, width, EXACT_NUMBERS):
-            self._network(features(part), out=outputs[start : start + len(part)])
+            self.network(features(part), out=outputs[start : start + len(part)])
             start += len(part)
         return outputs
 
     def read(self, outputs: Tensor) -> dict[str, RowContext]:
         """Distributions by group that outputs [n, sum(shape.outputs)] stand for."""
-        parts = torch.split(outputs, self._shape.outputs, dim=1)
-        multipliers = torch.from_numpy(step_multipliers(parts[6].numpy()) + self._step_offset)
+        parts = torch.split(outputs, self.shape.outputs, dim=1)
+        multipliers = torch.from_numpy(step_multipliers(parts[6].numpy()) + self.step_offset)
         return {
             group: RowContext(parts[2 * i], parts[2 * i + 1], multipliers[:, i : i + 1])
             for i, group in enumerate(GROUPS)

@@ -15,7 +15,7 @@ from splatwizard_core.tooling import (
     print_table,
     say,
 )
-from splatwizard_native import build_all
+from sw_doctor.building import build_all
 from sw_doctor.declared_modules import declared_modules
 
 

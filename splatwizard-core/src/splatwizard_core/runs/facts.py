@@ -36,13 +36,10 @@ class StepFacts(Block):
 
 
 class TrainingFacts(StepFacts, TrainBlock):
-    """Outcome of a training.
+    """Outcome of a training; `checkpoints` is not empty where they lie with another rate point, `trained_in`.
 
-    file        name and sha256 of the .ply that it came from in place of a training
-    rasterizers features asked for -> who served them
     raster      what the header of its file asks of a rasterizer
-    made_by     distribution -> version
-    checkpoints not empty: they lie elsewhere, with the rate point `trained_in`
+    file        name and sha256 of the .ply that it came from in place of a training
     """
 
     plan: list[StagePlan] = []
@@ -69,12 +66,7 @@ class TrainingFacts(StepFacts, TrainBlock):
 
 
 class EncodingFacts(StepFacts):
-    """Outcome of an encoding.
-
-    bytes           size of the file
-    float32_bytes   of the model's parameters as they were trained
-    parts           that served
-    """
+    """Outcome of an encoding; `float32_bytes` are those of the model's parameters as they were trained."""
 
     encode_s: float
     float32_bytes: int = 0
@@ -85,12 +77,7 @@ class EncodingFacts(StepFacts):
 
 
 class DecodingFacts(StepFacts, DecodeFigures):
-    """Outcome of the timed decodes of a file.
-
-    digest      of the model; equal models have equal digests
-    raster      what the header asks of a rasterizer
-    peak_bytes  memory growth over the first decode
-    """
+    """Outcome of the timed decodes of a file; `peak_bytes` is the growth over the first."""
 
     method: str
     method_version: int
@@ -106,34 +93,21 @@ class DecodingFacts(StepFacts, DecodeFigures):
 
 
 class Extent(Block):
-    """Extent of a measurement.
-
-    repeats     of the speed
-    metrics     name -> identity of what its values depend on; None: it cannot be computed now
-    eval_train  whether training views are among it
-    """
+    """Extent of a measurement; `metrics` tells what the values of each depend on, None: it cannot be computed now."""
 
     repeats: int
     metrics: dict[str, Any]
     eval_train: bool = False
 
     def holds(self, asked: Extent) -> bool:
-        """Whether a measurement of this extent has all that is asked for.
-
-        One that has more is kept: a run that was measured with LPIPS, or five times over, does not lose that because a
-        later command does not ask for it.
-        """
+        """Whether a measurement of this extent has all that is asked for; one that has more is kept."""
         wanted = {name: now for name, now in asked.metrics.items() if now is not None}
         enough = self.repeats >= asked.repeats and self.eval_train >= asked.eval_train
         return enough and all(self.metrics.get(name) == now for name, now in wanted.items())
 
 
 class Measurement(StepFacts, Quality):
-    """Outcome of measuring a model on a scene; `asked` where a run remembers it.
-
-    drawn_gaussians     mean over the test views of the number handed to the rasterizer
-    renders             files of the test views, where they were kept
-    """
+    """Outcome of measuring a model on a scene; `asked` where a run remembers it, `renders` where they were kept."""
 
     digest: str
     drawn_gaussians: float | None = None

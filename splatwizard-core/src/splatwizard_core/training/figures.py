@@ -47,10 +47,8 @@ class LoopFigures(Block):
 class TrainingFigures(LoopFigures, frozen=False):
     """Figures of a training over all its stages and processes; part of every checkpoint.
 
-    stage_seconds   stage name -> wall clock of its loop without housekeeping
-    stage_steps     stage name -> steps done
+    stage_seconds, stage_steps, provided    by name of the stage: its loop without housekeeping, steps done, who served
     rasterizers     features asked for -> who served them
-    provided        stage name -> the rasterizers, pruners, ... that served it
     """
 
     pictures_in: str = "host"

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from splatwizard_core.base.rng import Streams
 from splatwizard_core.base.run_log import RunLog
 from splatwizard_core.errors import CheckpointError, ConfigError
 from splatwizard_core.gaussians.splat_model import SplatModel
@@ -29,7 +30,6 @@ from splatwizard_core.training.figures import Provided, StagePlan, TrainingFigur
 from splatwizard_core.training.housekeeping import Evaluate, Housekeeping, OnStep
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.plan import plan_rows
-from splatwizard_core.training.rng import Streams
 from splatwizard_core.training.scheduler import build_schedulers
 from splatwizard_core.training.stage import Stage, StageContext
 from splatwizard_core.training.state import TrainingState
@@ -48,12 +48,7 @@ class TrainingStopped(KeyboardInterrupt):
 
 @dataclass(frozen=True)
 class TrainOutcome:
-    """A finished training.
-
-    model   as the last stage's `finish` returned it
-    figures of all stages, of resumed processes too
-    plan    of each stage
-    """
+    """A finished training: the model as the last stage's `finish` returned it, figures and plan of all stages."""
 
     model: SplatModel
     figures: TrainingFigures

@@ -70,19 +70,16 @@ class Trainer:
             )
         # Backward in this thread: torch's own for the GPU would be woken up each time, and take the interpreter's lock.
         with torch.autograd.set_multithreading_enabled(False):
-            self._run_steps(min(until, stage.iterations), after_step)
+            while state.step < min(until, stage.iterations) and not state.stopped:
+                try:
+                    self.run_step()
+                except (EmptyModel, TaskError):
+                    self.check_losses()  # what a step with a loss that is not finite leaves behind may have caused it
+                    raise
+                except torch.cuda.OutOfMemoryError as error:
+                    raise self._out_of_memory(error) from error
+                after_step(state)
         self.check_losses()
-
-    def _run_steps(self, until: int, after_step: Callable[[TrainingState], None]) -> None:
-        while self.state.step < until and not self.state.stopped:
-            try:
-                self.run_step()
-            except (EmptyModel, TaskError):
-                self.check_losses()  # what a step with a loss that is not finite leaves behind may have caused it
-                raise
-            except torch.cuda.OutOfMemoryError as error:
-                raise self._out_of_memory(error) from error
-            after_step(self.state)
 
     def run_step(self) -> None:
         """Run the next step, whatever its number."""

@@ -114,7 +114,7 @@ class IntegerMlp:
         if rows is None and inputs.device.type == self._layers[0][0].device.type == "cpu" and EXACT.try_load():
             found = torch.empty(len(inputs), self.outputs, dtype=torch.int64) if out is None else out
             parts = parts if further is None else [p.to(torch.int64) for p in parts]
-            torch.ops.sw_codecs_exact.network([_for_kernel(p) for p in parts], self.tensors(), self._leak, found)
+            torch.ops.sw_codecs_exact.network([for_kernel(p) for p in parts], self.tensors(), self._leak, found)
             return found
         inputs = torch.cat(parts, dim=1)
         rows = rows or NUMBERS_AT_ONCE // max(max(w.shape) for w, _ in self._layers)
@@ -129,24 +129,6 @@ class IntegerMlp:
         """Integers of all weights and biases, layer by layer, float64 [P]."""
         return torch.cat([each.reshape(-1) for each in self.tensors()])
 
-    def forecast(
-        self, inputs: Tensor, multipliers: Tensor, thresholds: Tensor, centre: list[Tensor], number: list[Tensor],
-        steps: Tensor,
-    ) -> bool:  # fmt: skip
-        """Evaluate, and put outputs on the lattice at once; whether all of it is within range. Needs the kernels.
-
-        Outputs are means and scales [C, C] of each group, and at the end a step output of each.
-
-        inputs      as of a call
-        multipliers, thresholds     int64 [128] by step output, and [63]: `entropy.exact_tables`
-        centre, number      of each group int32 and int16 [n,C], written: see `entropy.lattice.RowLattice`
-        steps       int64 [n, groups], written
-        """
-        status: int = torch.ops.sw_codecs_exact.forecast(
-            [_for_kernel(inputs)], self.tensors(), multipliers, thresholds, centre, number, steps
-        )
-        return status == 0
-
     def _evaluate(self, inputs: Tensor) -> Tensor:
         device = self._layers[0][0].device
         a = inputs.to(device, torch.float64).clamp(-ACTIVATION_LIMIT, ACTIVATION_LIMIT)
@@ -158,7 +140,7 @@ class IntegerMlp:
         return a.to(torch.int64).to(inputs.device)
 
 
-def _for_kernel(inputs: Tensor) -> Tensor:
+def for_kernel(inputs: Tensor) -> Tensor:
     """int16, or int64 with rows that have no gaps."""
     inputs = inputs if inputs.dtype == torch.int16 else inputs.to(torch.int64)
     return inputs if inputs.dtype == torch.int64 and inputs.stride(1) == 1 else inputs.contiguous()

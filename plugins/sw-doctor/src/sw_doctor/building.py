@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import pkgutil
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatwizard_native import cuda_toolkit
-from splatwizard_native.errors import NativeBuildError
-from splatwizard_native.module import NativeModule, Say
-from splatwizard_native.toolchain import Toolchain
+from splatwizard_native import NativeBuildError, NativeModule, Toolchain, toolkit_mismatch
 
 
 @dataclass(frozen=True)
@@ -45,7 +42,7 @@ def build_all(
     force: bool = False,
     cuda: bool = False,
     jobs: int | None = None,
-    say: Say | None = None,
+    say: Callable[[str], None] | None = None,
 ) -> list[BuildRow]:
     """Build the native modules that `targets` ("module:attribute") name; one row each, in their order.
 
@@ -62,7 +59,7 @@ def build_all(
         started = time.monotonic()
         try:
             module = resolve_module(target)
-            missing = cuda_toolkit.mismatch() if cuda and module.cuda_sources else None
+            missing = toolkit_mismatch() if cuda and module.cuda_sources else None
             if missing is not None:
                 raise NativeBuildError(f"the CUDA kernels of '{module.name}' cannot be built: {missing}")
             folder = module.prebuilt_folder if into_packages else module.cache_folder
