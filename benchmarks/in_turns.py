@@ -115,7 +115,8 @@ def train_in_slices() -> None:
 
 def compare(versions: dict[str, str], args: argparse.Namespace, seed: int) -> dict[str, Version]:
     """Train each once with this seed, in turns."""
-    options = ["--method", args.method, "--scene", args.scene, "--preset", args.preset, "--device", args.device, "--seed", str(seed)]
+    options = ["--method", args.method, "--scene", args.scene, "--preset", args.preset]
+    options += ["--device", args.device, "--seed", str(seed)]
     options += [part for assignment in args.set for part in ("--set", assignment)]
     options += ["--set", "checkpoint_every=1000000000"]
     with tempfile.TemporaryDirectory() as folder:
