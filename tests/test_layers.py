@@ -159,7 +159,7 @@ FOR_ONE = {
     "sw_gaussians.baking": "makes explicit Gaussians of a model for sw-view, and knows the parts of GaussianModel",
     "sw_gaussians.bake_refining": "trains on pictures that sw-view gives it, with the stage of sw-gaussians",
 }
-"""Module of a library that one family alone reaches -> why it is there; at most ten in the end."""
+"""Module of a library that one family alone reaches -> why it is there; at most ten."""
 
 
 def test_a_library_holds_what_two_families_use():
@@ -185,6 +185,7 @@ def test_a_library_holds_what_two_families_use():
         families = [family for family, modules in reach.items() if module in modules]
         if offered and len(families) < 2 and module not in named:
             lonely[module] = f"{lines_of(module)} lines, for {', '.join(families) or 'nobody'}"
+    assert len(FOR_ONE) <= 10
     assert not set(lonely) - set(FOR_ONE), "\n".join(f"{module}: {what}" for module, what in sorted(lonely.items()))
 
 

@@ -1,4 +1,4 @@
-"""channel-ar: each slice sees only those before it, in floats and in integers alike."""
+"""Channel-wise model: each slice sees only those before it, in floats and in integers alike."""
 
 import pytest
 import torch

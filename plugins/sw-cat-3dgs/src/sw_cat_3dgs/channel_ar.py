@@ -1,4 +1,4 @@
-"""Context model `channel-ar`: channels in slices, each predicted better by the slices before it.
+"""Channel-wise model: features in slices, each predicted better from the slices before it.
 
 What another context says of mean and scale of a slice is refined by a small network that sees the decoded values of the
 earlier slices of the same row; rows do not depend on one another. Further attributes may be refined by all slices.

@@ -1,4 +1,4 @@
-"""Context model `triplane`: features of a place from three learned planes at several scales.
+"""Triplane: features of a place from three learned planes at several scales.
 
 Trained in floats (bilinear, gradients to the planes); the file holds integers, from which both sides compute the same
 features in integers: bilinear weights of 12 bits an axis. Source: CAT-3DGS (arXiv 2503.00357); exact form: the exact
