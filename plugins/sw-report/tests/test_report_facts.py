@@ -3,12 +3,17 @@
 import json
 import re
 from pathlib import Path
+from typing import Annotated
 
 import pytest
-from sw_report.facts import LARGEST_RECORD, LONGEST_TEXT, clean, read_facts
+from pydantic import Field
+from sw_report.facts import LARGEST_RECORD, LONGEST_TEXT, RunFacts, clean, read_facts
+from sw_report.results_tables import cost_table
 from sw_report.runs import collect
 
+from splatwizard_core.base.block import Shown
 from splatwizard_core.errors import UserInputError
+from splatwizard_core.evaluation.speed import SpeedBlock
 
 
 def written(path: Path, content: object) -> Path:
@@ -23,6 +28,20 @@ def test_a_record_of_today_is_read_without_remark(make_run):
     assert facts.train.steps == 300
     assert facts.speed.fps == 12.5
     assert facts.rules()["resolution"] == -1
+
+
+def test_a_field_that_is_marked_to_be_shown_needs_nothing_else(make_run):
+    class MoreSpeed(SpeedBlock):
+        slowest_s: Annotated[float | None, Shown("slowest frame", "s")] = Field(None, description="of all frames")
+
+    class More(RunFacts):
+        speed: MoreSpeed = MoreSpeed()
+
+    content = json.loads((make_run() / "metrics.json").read_text())
+    content["speed"]["slowest_s"] = 1.25
+    rows = {row.cells[0].text: [cell.text for cell in row.cells[1:]] for row in cost_table(More(**content)).rows}
+    assert rows["slowest frame"] == ["1.25 s", "of all frames"]
+    assert rows["encoding"] == ["0.10 s", "to the closed file"]
 
 
 def test_an_older_record_is_read_and_its_schema_told(make_run):
