@@ -97,6 +97,14 @@ def test_removals_follow_the_end_of_densification():
     assert {"soft prune", "hard prune"}.isdisjoint(plan_of(stage_of(prune__soft=0, prune__hard=0)))
 
 
+@pytest.mark.parametrize("order", [1, -1])
+def test_the_density_control_of_3dgs_can_be_chosen_and_set(order):
+    sets = [("base.density", "mcmc"), ("base.density.settings.cap", "700")][::order]
+    (stage,) = SpeedySplat(load_plugins(), resolve(SpeedySplat, "paper", sets=dict(sets)).config).stages()
+    assert (stage.densify_stop, stage.inner.control.settings.cap) == (25_000, 700)
+    assert "relocate" in plan_of(stage)
+
+
 def test_every_key_of_3dgs_can_be_set_and_a_wrong_one_is_told():
     stage = stage_of(base__densify__interval="50", base__lr__opacity="0.025", base__sh_degree="1")
     assert plan_of(stage)["prune and densify"] == "range(500, 15000, 50)"

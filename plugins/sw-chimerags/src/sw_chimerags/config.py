@@ -10,6 +10,7 @@ from pydantic import Field
 from sw_gaussians.choices import Choice, Choosing, Moved, PrunerChoice
 from sw_gaussians.finetune.distillation import DistillLoss
 from sw_gaussians.finetune.fine_tuning import FineTuningRates
+from sw_gaussians.older_keys import within
 
 from splatwizard_core.api import Params
 
@@ -114,4 +115,4 @@ class ChimeraConfig(Choosing):
     def translated(self, values: dict[str, Any]) -> dict[str, Any]:
         if values.pop("vq.preset", "own") == "toolkit":
             values["vq.training"] = "official"
-        return values
+        return within(values, "student.base.")

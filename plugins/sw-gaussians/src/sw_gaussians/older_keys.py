@@ -85,9 +85,9 @@ def translated(values: dict[str, Any], density: DensityChoice) -> dict[str, Any]
 
 
 def within(values: Mapping[str, Any], prefix: str) -> dict[str, Any]:
-    """Return values by dotted key with today's keys of `densify` in a block of another method's values.
+    """Return values by dotted key with today's keys of density control in a block of another method's values.
 
-    prefix  of the block, such as "base."; a table that stands there whole is flattened
+    prefix  of the block, such as "base."; a table that stands there whole is flattened, a name alone gets its key
     """
     found: dict[str, Any] = {}
     for key, value in values.items():
@@ -106,5 +106,7 @@ def _flat(table: Mapping[str, Any], prefix: str) -> dict[str, Any]:
 
 
 def _today(key: str, prefix: str) -> str:
+    if key == f"{prefix}density":
+        return f"{key}.name"
     moved = DENSIFY.get(key.removeprefix(prefix)) if key.startswith(prefix) else None
     return f"{prefix}{moved.keys[0]}" if moved is not None and moved.keys else key

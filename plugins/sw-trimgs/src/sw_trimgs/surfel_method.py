@@ -56,7 +56,8 @@ class Trim2DGSScratch(GaussianMethod):
             "surface.lambda_dist": config.surface.lambda_dist,
             "surface.lambda_normal": 0.0,  # ours leaves out edges
         }
-        if values.get("density", values.get("density.name", "adc")) == "adc" or "settings" in values.get("density", {}):
+        density = values.get("density", {})
+        if density == "adc" or (isinstance(density, Mapping) and density.get("name", "adc") == "adc"):
             own["density.settings.world_prune"] = NO_SIZE_RULE
         if config.surface.depth_ratio is not None:
             own["surface.depth_ratio"] = config.surface.depth_ratio
