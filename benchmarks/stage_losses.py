@@ -76,7 +76,7 @@ class Run:
         self.out = directory.resolve().parents[2]
         with finished_training(self.session, self.resolved, directory) as trained:
             self.trained: TrainedModel = trained
-        raster = trained.facts["raster"]
+        raster = trained.facts.raster
         self.rasterizer = self.session.rasterizer(self.resolved, suggested_rasterizers(raster))
         self.options = render_options(raster, self.scene.background.to(self.session.device))
 

@@ -46,7 +46,7 @@ from splatwizard_core.runs.pretrained import make_method
 from splatwizard_core.runs.session import Session
 from splatwizard_core.streams import stream
 from splatwizard_core.training.pipeline import TrainingRun
-from splatwizard_core.training.trainer import StepRecord
+from splatwizard_core.training.state import TrainingState
 from splatwizard_native import work_time
 
 WINDOW = 40  # steps that are timed, and as many after them that are profiled
@@ -85,7 +85,7 @@ class Watch:
     _wall: float = 0.0
     _profile: profile | None = None
 
-    def __call__(self, record: StepRecord) -> None:
+    def __call__(self, record: TrainingState) -> None:
         for start in self.starts:
             if record.step == start:
                 torch.cuda.synchronize()
@@ -100,7 +100,7 @@ class Watch:
                 self._profile.__exit__(None, None, None)
                 self._report(record)
 
-    def _report(self, record: StepRecord) -> None:
+    def _report(self, record: TrainingState) -> None:
         assert self._profile is not None
         found = self._profile.key_averages()
         on_device = [e for e in found if str(e.device_type).endswith("CUDA")]
