@@ -158,7 +158,7 @@ def test_updates_in_the_backward_pass_are_those_of_the_optimizer(values, monkeyp
         outcomes.append(trainer)
         assert sum(fused) == (49 if fuses else 0)  # the moments exist from the first update on
         fused.clear()
-    plain, other = outcomes
+    plain, other = (trainer.state for trainer in outcomes)
     for name, parameter in plain.model.named_parameters():
         mine, theirs = parameter.detach(), dict(other.model.named_parameters())[name].detach()
         assert float(mine.norm()) > 0

@@ -165,6 +165,7 @@ def test_spawning_on_a_gpu_equals_spawning_on_the_cpu():
     for device in ("cpu", "cuda"):
         moved = tuple(network.to(device) for network in networks)
         leaves = [t.to(device).requires_grad_() for t in (*tensors[1:], masks)]
+        assert spawn.fits(*leaves)
         spawned = spawn.spawn(tensors[0].to(device), *leaves, moved)
         leaves += [p for network in moved for p in network.parameters()]
         parts = (spawned.means, spawned.opacities, spawned.scales, spawned.quats, spawned.colors)
@@ -183,6 +184,7 @@ def test_where_it_is_asked_for_gradients_of_an_anchor_are_the_same_each_time_and
 
     def gradients(device):
         leaves = [t.to(device).requires_grad_() for t in (*tensors, masks)]
+        assert spawn.fits(*leaves)
         found = spawn.visible_gaussians(*leaves)
         parts = (found.means, found.opacities, found.scales, found.quats, found.colors)
         return torch.autograd.grad(sum(part.pow(3).sum() for part in parts), leaves)
