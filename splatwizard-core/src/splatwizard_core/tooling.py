@@ -26,8 +26,7 @@ MODULES = {
     "runs.decode": "export_model exporter_of open_model read_gaussians",
     "runs.session": "Session",
     "runs.device": "choose_device",
-    "runs.measure": "open_subject opener",
-    "gaussians.placement": "in_world",
+    "runs.measure": "open_subject",
     "scene.loading": "load_scene",
     "scene.locate": "DATA_VARIABLE",
     "training.pipeline": "TrainingRun TrainingStopped",
@@ -44,10 +43,8 @@ MODULES = {
         "methods_option options preset_option print_facts print_json print_table rates_option repeats_option say "
         "scene_option seeds_option set_option"
     ),
-    "cli.complete": "COMPLETION_VARIABLE SCENE SCENE_OR_FILE name_of",
-    "cli.paths": "EXISTING INPUT_FILE OUTPUT_FILE OUTPUT_FOLDER existing existing_file",
-    "cli.streams": "without_orders",
-    "runs.file_needs": "missing_parts missing_plugin",
+    "cli.complete": "COMPLETION_VARIABLE SCENE name_of",
+    "cli.paths": "EXISTING OUTPUT_FILE OUTPUT_FOLDER existing_file",
     "cli.setup": "Choices open_session takes_choices",
     "plugins.remedies": "as_installed",
 }

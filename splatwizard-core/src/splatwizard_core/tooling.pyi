@@ -3,7 +3,6 @@ from splatwizard_core.base.lock import directory_lock as directory_lock
 from splatwizard_core.base.toml_file import read_toml as read_toml
 from splatwizard_core.cli.complete import COMPLETION_VARIABLE as COMPLETION_VARIABLE
 from splatwizard_core.cli.complete import SCENE as SCENE
-from splatwizard_core.cli.complete import SCENE_OR_FILE as SCENE_OR_FILE
 from splatwizard_core.cli.complete import name_of as name_of
 from splatwizard_core.cli.options import config_option as config_option
 from splatwizard_core.cli.options import console as console
@@ -26,15 +25,12 @@ from splatwizard_core.cli.options import scene_option as scene_option
 from splatwizard_core.cli.options import seeds_option as seeds_option
 from splatwizard_core.cli.options import set_option as set_option
 from splatwizard_core.cli.paths import EXISTING as EXISTING
-from splatwizard_core.cli.paths import INPUT_FILE as INPUT_FILE
 from splatwizard_core.cli.paths import OUTPUT_FILE as OUTPUT_FILE
 from splatwizard_core.cli.paths import OUTPUT_FOLDER as OUTPUT_FOLDER
-from splatwizard_core.cli.paths import existing as existing
 from splatwizard_core.cli.paths import existing_file as existing_file
 from splatwizard_core.cli.setup import Choices as Choices
 from splatwizard_core.cli.setup import open_session as open_session
 from splatwizard_core.cli.setup import takes_choices as takes_choices
-from splatwizard_core.cli.streams import without_orders as without_orders
 from splatwizard_core.coding.limits import decoded_limit as decoded_limit
 from splatwizard_core.errors import RunLockedError as RunLockedError
 from splatwizard_core.evaluation.evaluate import png_names as png_names
@@ -44,7 +40,6 @@ from splatwizard_core.evaluation.evaluate import save_png as save_png
 from splatwizard_core.evaluation.evaluate import suggested_rasterizers as suggested_rasterizers
 from splatwizard_core.evaluation.metrics import MetricInfo as MetricInfo
 from splatwizard_core.evaluation.metrics import short_reason as short_reason
-from splatwizard_core.gaussians.placement import in_world as in_world
 from splatwizard_core.plugins.check import Check as Check
 from splatwizard_core.plugins.check import State as State
 from splatwizard_core.plugins.loading import PluginInfo as PluginInfo
@@ -63,11 +58,8 @@ from splatwizard_core.runs.device import choose_device as choose_device
 from splatwizard_core.runs.directory import OWN_FILES as OWN_FILES
 from splatwizard_core.runs.directory import RunRequest as RunRequest
 from splatwizard_core.runs.directory import run_directory as run_directory
-from splatwizard_core.runs.file_needs import missing_parts as missing_parts
-from splatwizard_core.runs.file_needs import missing_plugin as missing_plugin
 from splatwizard_core.runs.identity import recorded_hash as recorded_hash
 from splatwizard_core.runs.measure import open_subject as open_subject
-from splatwizard_core.runs.measure import opener as opener
 from splatwizard_core.runs.observers import FinishedRun as FinishedRun
 from splatwizard_core.runs.observers import FinishedRuns as FinishedRuns
 from splatwizard_core.runs.observers import StartedTraining as StartedTraining

@@ -19,7 +19,7 @@ from splatwizard_core.cli.main import cli, main
 from splatwizard_core.plugins import catalogue, load_plugins
 
 COMMANDS = (
-    "run", "train", "encode", "decode", "eval", "list-plugins", "schedule",
+    "run", "train", "encode", "decode", "eval", "export", "info", "list-plugins", "schedule",
 )  # fmt: skip
 """Of the core."""
 

@@ -43,7 +43,6 @@ def register_downloads(registry: Registry) -> None:
 
 @hookimpl
 def register_commands(registry: Registry) -> None:
-    registry.add("info", "sw_datasets.commands.info:info", position=6, summary="what is in a file or scene")
     registry.add("data", "sw_datasets.commands.data:data", position=10,
                  summary="scenes on disk: list, verify, fetch, undistort, synth")  # fmt: skip
 

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 def register_commands(registry: Registry) -> None:
     registry.add("render", "sw_view.render_command:render", position=4.5,
                  summary="draw an encoded scene: pictures, depth, normals")  # fmt: skip
-    registry.add("export", "sw_view.export_command:export", position=5, summary=".ply and other interchange formats")
     registry.add("bake", "sw_view.bake_command:bake", position=4.6,
                  summary="make explicit Gaussians of anchors, for viewers")  # fmt: skip
     registry.add("view", "sw_view.view_command:view", position=4.65, summary="look at decoded models in the browser")

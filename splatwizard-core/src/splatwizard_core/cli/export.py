@@ -6,26 +6,17 @@ from pathlib import Path
 
 import click
 
-from splatwizard_core.tooling import (
-    INPUT_FILE,
-    OUTPUT_FILE,
-    Choices,
-    debug_option,
-    device_option,
-    json_option,
-    load_plugins,
-    name_of,
-    open_session,
-    options,
-    print_facts,
-    takes_choices,
-)
+from splatwizard_core.cli import options as shared
+from splatwizard_core.cli.complete import name_of
+from splatwizard_core.cli.paths import INPUT_FILE, OUTPUT_FILE
+from splatwizard_core.cli.setup import Choices, open_session, takes_choices
+from splatwizard_core.plugins import load_plugins
 
 
 @click.command(short_help=".ply and other interchange formats")
 @click.argument("file", metavar="FILE", type=INPUT_FILE)
 @click.argument("out", metavar="OUT", type=OUTPUT_FILE)
-@options(
+@shared.options(
     click.option(
         "--format", "exporter", metavar="NAME", type=name_of("exporter"),
         help="Exporter, see `sw list-plugins`.  [default: by the suffix of OUT]",
@@ -35,12 +26,15 @@ from splatwizard_core.tooling import (
         help="Write coordinates of the world that the scene's files are in, where the scene was moved to a local "
         "origin: as doubles in a .ply.",
     ),
-    device_option, json_option, debug_option,
+    shared.device_option, shared.json_option, shared.debug_option,
 )  # fmt: skip
 @takes_choices
 def export(file: Path, out: Path, exporter: str | None, world: bool, as_json: bool, chosen: Choices) -> None:
     """Decode FILE (.swz, .ply or another format) and write it to OUT in the format of its suffix, such as .ply."""
-    from splatwizard_core.tooling import bytes_with_named, export_model, in_world, opener
+    from splatwizard_core.gaussians.placement import in_world
+    from splatwizard_core.runs.decode import export_model
+    from splatwizard_core.runs.measure import opener
+    from splatwizard_native import bytes_with_named
 
     plugins = load_plugins()
     session = open_session(chosen.resolve_without_method(), plugins)
@@ -49,4 +43,4 @@ def export(file: Path, out: Path, exporter: str | None, world: bool, as_json: bo
         model = in_world(model, file.name)
     name = export_model(model, out, plugins, exporter)
     facts = {"file": str(out), "format": name, "bytes": bytes_with_named(out), "counts": model.counts()}
-    print_facts(facts, as_json, f"{facts['bytes']:,} bytes ({name}): {out}")
+    shared.print_facts(facts, as_json, f"{facts['bytes']:,} bytes ({name}): {out}")
