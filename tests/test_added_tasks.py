@@ -2,13 +2,12 @@
 
 import pytest
 from small_scene import context_of, small_scene, ten_gaussians
-from sw_gaussians.late_batches import BatchingOptimizer
 
 from splatwizard_core.errors import TaskSignatureError
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.plugins.catalogue import is_ours
 from splatwizard_core.training.added_tasks import add_tasks
-from splatwizard_core.training.optimizer import ParamGroup
+from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
 from splatwizard_core.training.params import AddedTask, OptimizationParams, PipelineParams
 from splatwizard_core.training.scheduler import build_schedulers
 from splatwizard_core.training.stage import Stage
@@ -31,7 +30,7 @@ def test_it_is_in_the_plan_of_a_stage_that_knows_nothing_of_it(name):
     scene = small_scene()
     model = ten_gaussians(scene)
     context = context_of(model, scene)
-    context.optimizer = BatchingOptimizer(model, [ParamGroup("means", 0.1)])
+    context.optimizer = SplatOptimizer(model, [ParamGroup("means", 0.1)])
     if name == "mask-prune":
         with pytest.raises(TaskSignatureError, match="wants VolumeMaskedGaussians, this run has GaussianModel"):
             post.check(context)

@@ -78,7 +78,7 @@ def test_figures_of_earlier_releases_have_other_names(toy, tmp_path):
     found = toy.train(iterations=60, directory=tmp_path).figures
     assert found.peak_bytes == 1 << 50
     assert found.breakdown_s == {"toy": {"render": 3.0}}
-    assert found.train_s > 1000
+    assert int(found.train_s) // 1000 == 1  # the file has 1,000 s; a toy needs less
     assert found.steps == 60
 
 
