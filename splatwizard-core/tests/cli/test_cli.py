@@ -17,7 +17,9 @@ from sw_gaussians.start import gaussians_from_points
 
 from splatwizard_core.cli.main import cli, main
 from splatwizard_core.plugins import catalogue, load_plugins
+from splatwizard_core.runs import file_needs
 
+assert file_needs  # here, so that it does not keep the catalogue of a test that imports it first
 COMMANDS = (
     "run", "train", "encode", "decode", "eval", "export", "info", "list-plugins", "schedule",
 )  # fmt: skip
