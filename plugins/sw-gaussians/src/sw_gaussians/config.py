@@ -6,9 +6,9 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field
 
 from splatwizard_core.api import Params, SameResult, apply_overrides
-from sw_gaussians.choices import Exchangeable, Moved
 from sw_gaussians.density.choice import DensityChoice
 from sw_gaussians.learning_rate import rate_factors
+from sw_gaussians.named_blocks import Exchangeable, Moved
 from sw_gaussians.older_keys import OLDER, translated
 from sw_gaussians.pictures import Pictures
 
