@@ -131,7 +131,7 @@ CLOSURES = {
 """Method -> the most modules and lines of its closure, where not (45, 4,500)."""
 CLOSURE = (45, 4_500)
 NOT_YET = {
-    "sw_hac.method": (43, 5_070),
+    "sw_hac.method": (43, 4_920),
 }
 """Closures that are larger than that today; they may shrink, and go from here once they fit."""
 

@@ -4,9 +4,8 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from sw_gaussians.learning_rate import UpdateLearningRate
 from sw_gaussians.ply import export_ply
-from sw_gaussians.stage import ThreeDGSStage
+from sw_gaussians.stage import ThreeDGSStage, UpdateLearningRate
 from sw_gaussians.start import gaussians_from_points
 from sw_gaussians.tasks import PruneAndDensify, ResetOpacity
 

@@ -68,7 +68,8 @@ def make(n: int = 300, feature_dim: int = 8, k: int = 4, *, seed: int = 0, **kwa
 
 def predicted(model, rows):
     """Distributions of the anchors `rows`."""
-    return model.rate_model.predict(*model.context_of(rows))
+    found = model.rate_model
+    return found.read(found.network(found.grid(*model.context_of(rows))))
 
 
 def encoded(model: HACAnchors, **values) -> bytes:

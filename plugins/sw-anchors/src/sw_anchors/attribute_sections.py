@@ -52,7 +52,7 @@ class AttributeCoder:
     def __init__(
         self, count: int, shape: AnchorShape, mode: str, plugins: PluginManager, further: Coders | None = None
     ) -> None:
-        """Of `count` anchors, in mode "exact" or "float" of the entropy model `conditional-gaussian`.
+        """Code `count` anchors, in mode "exact" or "float" of the entropy model `conditional-gaussian`.
 
         further     entropy models for other contexts than its own
         """
@@ -61,7 +61,7 @@ class AttributeCoder:
         self.rows = self.coder.blocks(count, max(shape.widths))
 
     def code(self, block: Block, context: Any, step: Tensor, present: Tensor | None = None) -> Tensor:
-        """Code one block; its integers [n,C] int64, 0 where they are not in the file.
+        """Code one block and return its integers [n,C] int64, 0 where they are not in the file.
 
         context     distributions of its numbers in the units of the mode: RowContext, RowLattice, or a `further` one
         step        [n,1] float64, quantiser steps in units of the values
@@ -180,11 +180,11 @@ class ExactNetwork:
     def on_lattice(
         self, places: Tensor, features: Callable[[Tensor], Tensor], width: int
     ) -> Mapping[str, RowContext | RowLattice]:
-        """Distributions as of a call, put on the lattice of the coder at once where there is a kernel."""
+        """Return the distributions of a call, on the coder's lattice of tables already where there is a kernel."""
         return exact_lattice.on_lattice(self, places, features, width) or self(places, features, width)
 
     def __call__(self, places: Tensor, features: Callable[[Tensor], Tensor], width: int) -> dict[str, RowContext]:
-        """Distributions by group for anchors at `places` [n, ...].
+        """Predict distributions by group for anchors at `places` [n, ...].
 
         features    places of some rows -> int64 [rows, inputs] with 12 fractional bits; each row on its own
         width       the most numbers that a row has while they are looked up
@@ -192,7 +192,7 @@ class ExactNetwork:
         return self.read(self.outputs(places, features, width))
 
     def outputs(self, places: Tensor, features: Callable[[Tensor], Tensor], width: int) -> Tensor:
-        """Outputs of the network, int64 [n, sum(shape.outputs) + further]; arguments as of a call."""
+        """Return outputs of the network, int64 [n, sum(shape.outputs) + further]; arguments as of a call."""
         outputs = torch.empty(len(places), self.network.outputs, dtype=torch.int64)
         start = 0
         for part in parts_of(places, width, EXACT_NUMBERS):
@@ -201,7 +201,7 @@ class ExactNetwork:
         return outputs
 
     def read(self, outputs: Tensor) -> dict[str, RowContext]:
-        """Distributions by group that outputs [n, sum(shape.outputs)] stand for."""
+        """Read outputs [n, sum(shape.outputs)] as distributions by group."""
         parts = torch.split(outputs, self.shape.outputs, dim=1)
         multipliers = torch.from_numpy(step_multipliers(parts[6].numpy()) + self.step_offset)
         return {
@@ -210,6 +210,6 @@ class ExactNetwork:
         }
 
     def steps(self, group: str, context: RowContext | RowLattice) -> Tensor:
-        """[n,1] float64: quantiser steps of a group, in units of the values."""
+        """Return the quantiser steps [n,1] float64 of a group, in units of the values."""
         multipliers = torch.as_tensor(context.step)
         return multipliers.to(torch.float64) * (self._base_steps[GROUPS.index(group)] / (1 << FRACTION))

@@ -15,14 +15,15 @@ from torch import Tensor
 
 BITS = 16
 TOP = (1 << BITS) - 1
-SMALLEST_STEP = 1e-6
+FLAT_AXIS_STEP = 1e-6
+"""Lattice step of an axis without extent, world units."""
 
 Margin = Literal["origin", "extent", "none"]
 """Room around the anchors on their lattice, see `bounds_of`."""
 
 
 def bounds_of(positions: Tensor, margin: Margin = "none") -> Tensor:
-    """[2,3] float32: low and high end of the lattice for positions [N,3], N > 0.
+    """Return low and high end of the lattice for positions [N,3], N > 0, as [2,3] float32.
 
     margin  "none"; "extent": 10 % of the extent at each end; "origin": a fifth of each end's distance from the origin,
             as HAC has it, which is none where an end is 0 and much where the scene lies far out
@@ -37,19 +38,19 @@ def bounds_of(positions: Tensor, margin: Margin = "none") -> Tensor:
 
 
 def position_codes(positions: Tensor, bounds: Tensor) -> Tensor:
-    """[N,3] int64 in 0..65535; what lies outside the bounds is moved onto them."""
+    """Return the codes [N,3] int64 in 0..65535 of positions [N,3]; one outside the bounds is moved onto them."""
     low, step = low_and_step(bounds)
     return torch.floor((positions.detach().to(torch.float64) - low) / step).clamp(0, TOP).to(torch.int64)
 
 
 def coded_positions(codes: Tensor, bounds: Tensor) -> Tensor:
-    """[N,3] float32, world units."""
+    """Return the positions [N,3] float32, world units, that codes [N,3] stand for."""
     low, step = low_and_step(bounds)
     return (codes.to(torch.float64) * step + low).to(torch.float32)
 
 
 def low_and_step(bounds: Tensor) -> tuple[Tensor, Tensor]:
-    """Low end [3] and step [3] of the lattice, float64 world units; an axis without extent has SMALLEST_STEP."""
+    """Return low end [3] and step [3] of the lattice, float64 world units."""
     low, high = bounds.to(torch.float64).unbind(0)
     step = (high - low) / TOP
-    return low, torch.where(step > 0, step, torch.full_like(step, SMALLEST_STEP))
+    return low, torch.where(step > 0, step, torch.full_like(step, FLAT_AXIS_STEP))

@@ -1,4 +1,4 @@
-"""Values of anchors as training sees them: raw, or with noise in place of rounding; and their masks."""
+"""Values of anchors as training sees them, with their masks: raw, or with uniform noise in place of rounding."""
 
 from __future__ import annotations
 
@@ -34,7 +34,11 @@ class Noise:
 
 @dataclass(frozen=True)
 class NoisyValues:
-    """Of V anchors: features [V,F], scales [V,6], offsets [V,k,3], masks [V,k]; sample [S,C], all numbers of S."""
+    """Values of V anchors, and of the S whose bits are counted.
+
+    features [V,F], scales [V,6], offsets [V,k,3], masks [V,k] 0 or 1
+    sample          [S,C] all numbers of the sample side by side, in the order of `shape.GROUPS`
+    """
 
     features: Tensor
     scales: Tensor
@@ -63,7 +67,7 @@ def noisy_values(
 
 
 def draws(shape: tuple[int, int], generator: torch.Generator | None, device: torch.device) -> Tensor:
-    """U(0,1) float32 of `shape` for noise, of 16 bits each on a CPU, where 24 bits take three times as long."""
+    """Draw U(0,1) float32 of `shape` for noise: 16 bits each on a CPU, where 24 bits take three times as long."""
     if device.type != "cpu":
         return torch.rand(shape, generator=generator, device=device)
     count = shape[0] * shape[1]

@@ -1,7 +1,8 @@
-"""Rate models: what predicts how attributes of anchors are distributed, in training and for the file alike.
+"""Rate models: prediction of how attributes of anchors are distributed, in training and for the file alike.
 
 One object, built from the same grids and networks, gives the bits of a sample in training (`rate`) and the integer
-distributions of the file (`exact`): so what is trained is what is coded.
+distributions of the file (`exact`): training minimises the size of the file itself. A `Context` is what a rate model
+predicts from, an `AnchorContext` the distributions that it predicts.
 """
 
 from __future__ import annotations
@@ -18,9 +19,9 @@ from sw_codecs.entropy.rates import gaussian_bits, lower_bound
 
 Triple = tuple[Tensor, Tensor, Tensor]
 Context = tuple[Tensor, ...]
-"""Tensors with a row per anchor, without gradients: what a rate model predicts from, known before any attribute."""
+"""Inputs of a rate model: tensors with a row per anchor, without gradients, known before any attribute is decoded."""
 Rows: TypeAlias = "Tensor | slice"
-"""Some rows of a context: int64 numbers, or all from one on."""
+"""Some rows of a context: their int64 numbers, or a slice of all from one on."""
 
 SMALLEST_SCALE = 1e-9
 """Floor of a predicted deviation, as published."""
@@ -32,8 +33,8 @@ class AnchorForecast:
 
     steps           [V,3] quantiser step of each group; differentiable
     sample_steps    [S,3] those of the sample
-    outputs         [S,W] what the network says of the sample; the rate model that made them can read them
-    own_bits        scalar, differentiable: bits of all that the rate model itself stores, if it counts them here
+    outputs         [S,W] outputs of the network for the sample, which the rate model's own `rate` reads
+    own_bits        scalar, differentiable: bits of what the rate model itself stores, a grid say; None: not counted
     """
 
     steps: Tensor
@@ -47,8 +48,8 @@ class Floors:
     """Floors of a rate in training.
 
     probability     of a value
-    scale           of a predicted deviation, in quantiser steps; the gradient that would raise one from below passes.
-                    0: SMALLEST_SCALE, below which there is none
+    scale           of a predicted deviation, in quantiser steps; below it a gradient passes that would raise it.
+                    0: SMALLEST_SCALE in units of the values, below which there is no gradient
     """
 
     probability: float = 1e-6
@@ -166,9 +167,9 @@ def _shape(values: Tensor, masks: Tensor) -> AnchorShape:
 
 
 def floored(scale: Tensor, steps: Tensor, floors: Floors) -> Tensor:
-    """Keep predicted deviations [S,C] to their floor, for quantiser steps [S,C]; differentiable.
+    """Raise predicted deviations [S,C] to their floor, for quantiser steps [S,C]; differentiable.
 
-    Of a column whose deviations are all at SMALLEST_SCALE no value lies where a gradient would tell: none learns.
+    A deviation at SMALLEST_SCALE has no gradient: a column that starts there for all anchors never learns.
     """
     if floors.scale:
         return lower_bound(scale, floors.scale * steps.detach())

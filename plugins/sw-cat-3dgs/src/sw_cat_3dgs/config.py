@@ -8,7 +8,7 @@ from typing import ClassVar, Literal
 from pydantic import Field
 from sw_anchors.lattice import Margin
 from sw_anchors.params import CodedAnchorLearningRates, CodedAnchorParams
-from sw_gaussians.choices import Choosing, Moved, OwnCodec
+from sw_gaussians.named_blocks import Choosing, Moved, OwnCodec
 
 from splatwizard_core.api import Params
 

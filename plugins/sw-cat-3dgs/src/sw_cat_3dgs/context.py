@@ -28,7 +28,7 @@ from sw_codecs.context.two_layers import two_layers
 from sw_codecs.quantizers.rounding import add_noise
 
 STEP_OFFSET = 1.1
-"""A step is its base times (1.1 + tanh t): never zero."""
+"""A quantiser step is its base times (STEP_OFFSET + tanh t), t a step logit: 0.1 to 2.1 of the base, never zero."""
 PLANES = 3
 
 
@@ -59,7 +59,7 @@ class CatContext(nn.Module):
     triplane    planes of resolution 0 until the stage sets them up
     network     feature of a place -> means, scales, step logits
     slices      refine each slice of the features by those before it
-    arms        spatial model of each plane orientation
+    arms        spatial (autoregressive) model of each plane orientation, `SpatialAr`
     rounded     planes are used (and trained) as the file will have them
     in_steps    the network gives means and scales as multiples of base steps, not in the units of the values
     """
@@ -162,7 +162,7 @@ class CatContext(nn.Module):
         return found
 
     def read(self, outputs: Tensor) -> AnchorContext:
-        """The distributions that outputs of the network stand for."""
+        """Read outputs [V,W] of the network as means and deviations [V,C] and steps [V,1] of each group."""
         out = outputs.split(self.shape.outputs, dim=1)
         steps = (STEP_OFFSET + torch.tanh(out[6])) * out[6].new_tensor(self.shape.base_steps)  # [V,3]
         means, scales = ([out[2 * i + second] * unit for i, unit in enumerate(self.units)] for second in (0, 1))

@@ -24,7 +24,7 @@ class CatAnchors(CodedAnchors):
     view_weights    [N] buffer: views that see an anchor over their mean, times `view_factor`; multiplies its masks
     views_stale     anchors came or went since the views were counted
     context         predicts attributes
-    trained         parameters that get gradients
+    trained         parameters that get gradients, see `train_only`
     """
 
     ROWS = (*CodedAnchors.ROWS, "view_weights")

@@ -21,7 +21,7 @@ from sw_cat_3dgs.fast import forecast as fast_forecast
 from sw_codecs.entropy.rows import RowContext
 
 MULTIPLIER_OFFSET = 410
-"""Of a step in 1/4096 of its base: round(0.1 * 4096) on top of 4096 (1 + tanh t)."""
+"""Steps are base (1.1 + tanh t), `context.STEP_OFFSET`: in 1/4096 this is added to the table's 4096 (1 + tanh t)."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class CatRateModel:
     floors: Floors = PUBLISHED_FLOORS
 
     def forecast(self, rows: Context, sample: Rows) -> AnchorForecast:
-        """Predict the steps of all anchors, and the outputs of the network for the rows `sample`."""
+        """Predict the steps of all anchors, and for the rows `sample` the outputs that `read` reads."""
         predict = fast_forecast.forecast if fast_forecast.fits(rows) else forecast
         return predict(self.context, self.base, rows, sample)
 
@@ -77,7 +77,7 @@ def forecast(context: CatContext, base: Tensor, rows: Context, sample: Rows) -> 
 
 
 class ExactPredictor:
-    """Integers with 12 fractional bits: means and scales in base steps, a step as its multiple of the base."""
+    """A CatContext in integers with 12 fractional bits: means and scales in base steps, steps as multiples of it."""
 
     def __init__(self, context: CatContext) -> None:
         """Raises ValueError or BitstreamError for weights that no exact evaluation takes."""
@@ -107,7 +107,7 @@ class ExactPredictor:
 
 
 class FloatPredictor:
-    """Floats of the networks as trained, in units of the values."""
+    """A CatContext in floats as trained, in units of the values."""
 
     def __init__(self, context: CatContext) -> None:
         self.context = context

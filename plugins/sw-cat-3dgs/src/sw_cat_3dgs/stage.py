@@ -36,7 +36,10 @@ log = logging.getLogger(__name__)
 
 
 class CatStage(CodedAnchorStage):
-    """One stage of 40,000 steps."""
+    """One stage of 40,000 steps; the README says what is trained when.
+
+    "cam mask" of the plan are the view weights of the masks, "anchor bound" the 16-bit lattice of the positions.
+    """
 
     name = "cat-3dgs"
     opt: CatConfig
@@ -89,6 +92,7 @@ class CatStage(CodedAnchorStage):
         scheduler.register_task(self.at(phases.planes), self.train_everything)
 
     def update_cam_mask(self, model: CatAnchors, cameras: CameraIterator, rasterizer: Rasterizer) -> None:
+        """Count the views that see each anchor, where anchors came or went since the last time."""
         if model.views_stale:
             if self._cameras is None:  # moved once: moving to a GPU waits for it
                 self._cameras = [view.camera.to(model.device) for view in cameras]
@@ -101,6 +105,7 @@ class CatStage(CodedAnchorStage):
         model.views_stale = True  # also if as many came as went
 
     def setup_triplane(self, model: CatAnchors, optimizer: SplatOptimizer) -> None:
+        """Lay the principal axes through the anchors of now, and make planes as fine as their number asks for."""
         settings, context = self.opt.context, model.context
         resolution = base_resolution(model.num_rows, settings.anchors_per_cell)
         context.fit_frame(model.positions(), neighbors=settings.neighbors, contamination=settings.contamination)
@@ -111,10 +116,12 @@ class CatStage(CodedAnchorStage):
         log.debug("triplane of base resolution %d for %d anchors", resolution, model.num_rows)
 
     def train_spatial_models(self, model: CatAnchors) -> None:
+        """Train the spatial models alone for a while, or nothing as the authors' code does."""
         alone: Trained = "nothing" if self.opt.phases.official_warmup else "spatial models"
         model.train_only(alone)
 
     def round_planes(self, model: CatAnchors) -> None:
+        """Use the planes as the file will have them from now on, and count their bits."""
         model.context.rounded = True
 
     def train_all_but_planes(self, model: CatAnchors) -> None:
@@ -126,6 +133,7 @@ class CatStage(CodedAnchorStage):
     # Loss
 
     def extra_loss(self, model: Any, result: RenderResult, step: int) -> dict[str, Weighted]:
+        """Return the terms of masks, of the anchors' rate and of the planes' rate, each from its phase on."""
         rate = self.opt.rate_term
         terms: dict[str, Weighted] = {}
         if step >= self.at(self.opt.phases.quantize):
@@ -155,5 +163,5 @@ class CatStage(CodedAnchorStage):
 
 
 def base_resolution(anchors: int, anchors_per_cell: float) -> int:
-    """Base resolution of a triplane for so many anchors."""
+    """Return the rows of the coarsest planes, one cell per `anchors_per_cell` anchors; at least 1."""
     return max(1, round(math.sqrt(anchors / anchors_per_cell)))

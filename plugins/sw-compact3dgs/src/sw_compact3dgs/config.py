@@ -4,10 +4,10 @@ from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
-from sw_gaussians.choices import Choosing, Moved, OwnCodec
 from sw_gaussians.config import GaussianTraining, Loss
 from sw_gaussians.config import LearningRates as GaussianRates
 from sw_gaussians.density.choice import DensityChoice
+from sw_gaussians.named_blocks import Choosing, Moved, OwnCodec
 from sw_gaussians.older_keys import DENSIFY
 from sw_gaussians.pictures import Pictures
 

@@ -8,46 +8,22 @@ and bounds are those of `Settings`, the pydantic model of the class that is regi
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
-from pydantic import BaseModel, Field, ValidationError, create_model, model_validator
+from pydantic import BaseModel, Field, ValidationError, create_model
 
-from splatwizard_core.api import ConfigError, OptimizationParams, Params, PluginError, apply_overrides, given_values
+from splatwizard_core.api import ConfigError, Params, PluginError, apply_overrides, given_values
+from sw_gaussians.named_blocks import Choosing as Choosing
+from sw_gaussians.named_blocks import Exchangeable as Exchangeable
+from sw_gaussians.named_blocks import Moved as Moved
+from sw_gaussians.named_blocks import Named
+from sw_gaussians.named_blocks import OwnCodec as OwnCodec
 
 if TYPE_CHECKING:
     from splatwizard_core.api import GaussianCodec, PluginManager, Pruner
 
 ChoiceT = TypeVar("ChoiceT", bound="Choice")
-ExchangeableT = TypeVar("ExchangeableT", bound="Exchangeable")
-
-
-class Named(Params):
-    """Block whose name alone may stand for it: `codec = "NAME"` for `codec.name = "NAME"`.
-
-    NAME    field that holds the name
-    """
-
-    NAME: ClassVar[str] = "name"
-
-    @model_validator(mode="before")
-    @classmethod
-    def _of_name(cls, value: Any) -> Any:
-        return {cls.NAME: value} if isinstance(value, str) else value
-
-    @property
-    def chosen(self) -> str:
-        """Name that stands in it."""
-        found: str = getattr(self, self.NAME)
-        return found
-
-
-class OwnCodec(Named):
-    """Codec of a method whose file no other codec can write: subclasses fix `name` and type `settings`.
-
-    name        `Literal["their-method"]`: the method's name, or that of its codec where that one is registered
-    settings    block of typed fields
-    """
 
 
 class Choice(Named):
@@ -59,6 +35,10 @@ class Choice(Named):
 
     REGISTRY: ClassVar[str]
     PARTS: ClassVar[tuple[str, ...]] = ()
+
+    @classmethod
+    def settings_fields(cls) -> tuple[str, ...]:
+        return "settings", *cls.PARTS
 
     def provider(self, plugins: PluginManager, key: str) -> Callable[..., Any]:
         """Return the class that is registered under the name.
@@ -99,7 +79,7 @@ class Choice(Named):
         key = f"{path}.{self.NAME}"
         model = self._model(plugins, key)
         found: dict[str, dict[str, Any]] = {}
-        for field in ("settings", *self.PARTS):
+        for field in self.settings_fields():
             given = {f"{path}.{field}.{name}": value for name, value in getattr(self, field).items()}
             if model is None and given:
                 first = next(iter(given))
@@ -122,7 +102,6 @@ class Choice(Named):
         return found
 
     def settings_keys(self, plugins: PluginManager, path: str) -> dict[str, str]:
-        """Map the dotted keys of the provider's settings to their descriptions; `path` is that of this block."""
         model = self._model(plugins, path)
         fields = {} if model is None else model.model_fields
         return {f"{path}.settings.{name}": field.description or "" for name, field in fields.items()}
@@ -167,103 +146,6 @@ class PrunerChoice(Choice):
         self.provider(plugins, key)
         pruner: Pruner = plugins.pruners.load(self.pruner)(**self.settings)
         return pruner
-
-
-class Moved(NamedTuple):
-    """New place of a key of an older release.
-
-    keys        one or several; none: it is gone
-    default     value that the older release had; a key that is gone is refused with another one, if this is not None
-    provider    whose setting it is, for a key of settings: it is dropped where another is chosen
-    """
-
-    keys: tuple[str, ...]
-    default: Any = None
-    provider: str | tuple[str, ...] = ""
-
-    def checked(self, old: str, value: Any) -> Any:
-        """Return a value of the key `old`. Raises ConfigError if it is gone, and did something."""
-        if not self.keys and self.default is not None and str(value).lower() != str(self.default).lower():
-            raise ConfigError(f"'{old}' is gone since 0.3, with what {value} did: leave it out", key=old)
-        return value
-
-
-class Exchangeable(OptimizationParams):
-    """Base of configs with exchangeable parts.
-
-    OLDER       key of an older release -> where it stands now: config files, run directories and checkpoints with it
-                are read as before. "codec" stands there for a codec that was a name alone
-    """
-
-    OLDER: ClassVar[Mapping[str, Moved]] = {}
-
-    def spelled(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return values by dotted key with today's keys.
-
-        A name alone, `codec=NAME`, stands for the key of the name. Settings of another provider than the one named so
-        far are gone. Keys of `OLDER` become those of today.
-        """
-        named = dict(_blocks(self))
-        found = dict(values)
-        all_older = self._all_older()
-        for name in sorted({*named, *(old.partition(".")[0] for old in all_older)}):
-            if isinstance(found.get(name), Mapping):
-                found |= {f"{name}.{key}": value for key, value in found.pop(name).items()}
-        for path, block in named.items():
-            if isinstance(found.get(path), str):
-                found[f"{path}.{block.NAME}"] = found.pop(path)
-        found = self.translated(found)
-        older = {old: all_older[old].checked(old, found.pop(old)) for old in list(found) if old in all_older}
-        for old in [old for old in older if not all_older[old].provider]:
-            found |= dict.fromkeys(all_older[old].keys, older.pop(old))
-        chosen = {path: found.get(f"{path}.{block.NAME}", block.chosen) for path, block in named.items()}
-        for old, value in older.items():
-            moved = all_older[old]
-            whose = (moved.provider,) if isinstance(moved.provider, str) else moved.provider
-            found |= {key: value for key in moved.keys if chosen[key.partition(".")[0]] in whose}
-        anew: dict[str, Any] = {}
-        for path, block in named.items():
-            fields = [f"{path}.{each}" for each in ("settings", *block.PARTS)] if isinstance(block, Choice) else []
-            for key in fields:
-                if isinstance(found.get(key), Mapping):
-                    found |= {f"{key}.{name}": value for name, value in found.pop(key).items()}
-            if chosen[path] != block.chosen:
-                anew |= {f"{path}.{block.NAME}": chosen[path], **{key: {} for key in fields}}
-        return {**anew, **found}
-
-    @classmethod
-    def _all_older(cls) -> dict[str, Moved]:
-        """Return `OLDER` of this class and its bases."""
-        return {old: moved for base in reversed(cls.__mro__) for old, moved in vars(base).get("OLDER", {}).items()}
-
-    def translated(self, values: dict[str, Any]) -> dict[str, Any]:
-        """Return values by dotted key where more than a key has changed since an older release: a value, say."""
-        return values
-
-    def settings_keys(self, plugins: PluginManager) -> dict[str, str]:
-        """Map dotted keys of settings of the providers that it names to their descriptions."""
-        blocks = ((path, block) for path, block in _blocks(self) if isinstance(block, Choice))
-        return {key: told for path, block in blocks for key, told in block.settings_keys(plugins, path).items()}
-
-    def completed(self: ExchangeableT, plugins: PluginManager, sources: Mapping[str, str]) -> ExchangeableT:
-        """Return this with all settings of the providers that it names, checked. Raises ConfigError."""
-        content = super().completed(plugins, sources).model_dump()
-        for path, block in _blocks(self):
-            if isinstance(block, Choice):
-                content[path] |= block.completed(plugins, path, sources)
-        return type(self).model_validate(content)
-
-
-class Choosing(Exchangeable):
-    """Base of configs of a method: besides or in place of `GaussianTraining`."""
-
-
-def _blocks(config: BaseModel) -> Iterator[tuple[str, Named]]:
-    """Yield key and value of each block with a name."""
-    for name in type(config).model_fields:
-        block = getattr(config, name)
-        if isinstance(block, Named):
-            yield name, block
 
 
 def _checked(model: type[BaseModel], path: str, given: Mapping[str, Any], sources: Mapping[str, str]) -> dict[str, Any]:

@@ -1,8 +1,6 @@
-"""Learning rates as functions of the step, and of the length of a run."""
+"""Learning rates as functions of the step."""
 
 import math
-
-from splatwizard_core.api import Scene, SplatOptimizer
 
 
 def exponential_lr(
@@ -30,49 +28,3 @@ def exponential_lr(
         damping = delay_mult + (1 - delay_mult) * math.sin(0.5 * math.pi * min(step / delay_steps, 1.0))
     tau = min(step / max(max_steps, 1), 1.0)
     return damping * math.exp((1 - tau) * math.log(init) + tau * math.log(final))
-
-
-class UpdateLearningRate:
-    """Sets the step size of the means: exponential decay, times the scene extent."""
-
-    def __init__(
-        self,
-        *,
-        init: float = 1.6e-4,
-        final: float = 1.6e-6,
-        max_steps: int = 30_000,
-        delay_steps: int = 0,
-        delay_mult: float = 0.01,
-    ) -> None:
-        self.init, self.final, self.max_steps = init, final, max_steps
-        self.delay_steps, self.delay_mult = delay_steps, delay_mult
-
-    def rate(self, step: int, extent: float) -> float:
-        """The step size of the means at `step`, world units."""
-        return extent * exponential_lr(
-            step,
-            init=self.init,
-            final=self.final,
-            max_steps=self.max_steps,
-            delay_steps=self.delay_steps,
-            delay_mult=self.delay_mult,
-        )
-
-    def __call__(self, optimizer: SplatOptimizer, scene: Scene, step: int) -> None:
-        optimizer.set_lr("means", self.rate(step, scene.extent))
-
-
-SHORT, LONG = 0.4, 0.8
-"""Shares of the full plan up to which a run counts as short, and from which as long."""
-
-
-def rate_factors(share: float) -> dict[str, float]:
-    """Return by what two learning rates of the full plan are multiplied in a run of a share of its steps, > 0.
-
-    A short run ends with larger steps of the means, for they have less time to arrive; up to a long one the factor is
-    log-interpolated. SH bands 1 to 3 move twice as fast in all that is not long.
-
-    Source: LiteGS (arXiv 2503.01199), whose values are those of a third of the plan and of the whole; between: our own.
-    """
-    q = min(max((share - SHORT) / (LONG - SHORT), 0.0), 1.0)
-    return {"lr.position_final": 10.0 ** (1 - q), "lr.sh_rest": 2.0 if share < LONG else 1.0}

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from splatwizard_core.api import ConfigError
-from sw_gaussians.choices import Moved
 from sw_gaussians.density.choice import DensityChoice
+from sw_gaussians.named_blocks import Moved
 
 _SHARED = (
     "start", "stop", "interval", "grad_threshold", "percent_dense", "min_opacity", "reset_interval", "reset_opacity",

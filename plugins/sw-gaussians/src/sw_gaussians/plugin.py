@@ -17,7 +17,7 @@ def register_density_controls(registry: Registry) -> None:
 
 @hookimpl
 def register_tasks(registry: Registry) -> None:
-    registry.add("update-lr", "sw_gaussians.learning_rate:UpdateLearningRate",
+    registry.add("update-lr", "sw_gaussians.stage:UpdateLearningRate",
                  summary="exponential decay of the means' step size, times the scene extent", factory=True)  # fmt: skip
     registry.add("increase-sh-degree", "sw_gaussians.stage:increase_sh_degree",
                  summary="activate one more band of spherical harmonics", factory=False)  # fmt: skip

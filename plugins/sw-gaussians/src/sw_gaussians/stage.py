@@ -11,6 +11,7 @@ from splatwizard_core.api import (
     LossPack,
     ParamGroup,
     RasterOptions,
+    Scene,
     SplatOptimizer,
     Stage,
     StageContext,
@@ -20,7 +21,7 @@ from sw_gaussians.averaging import average_of_the_end
 from sw_gaussians.control_tasks import control_task
 from sw_gaussians.fast.fused_adam import FusingOptimizer, offer_updates
 from sw_gaussians.late_batches import AFTER_ALL, SumViews
-from sw_gaussians.learning_rate import UpdateLearningRate
+from sw_gaussians.learning_rate import exponential_lr
 from sw_gaussians.moments import keep_moments
 from sw_gaussians.sparse_adam import SparseSplatOptimizer
 
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
         OptimizationParams,
         PipelineParams,
         RenderResult,
-        Scene,
         Scheduler,
         SplatModel,
         TrainingState,
@@ -44,6 +44,36 @@ if TYPE_CHECKING:
     )
     from splatwizard_core.training.density import DensityReport, DensityTask
     from sw_gaussians.config import GaussianTraining
+
+
+class UpdateLearningRate:
+    """Sets the step size of the means: exponential decay, times the scene extent."""
+
+    def __init__(
+        self,
+        *,
+        init: float = 1.6e-4,
+        final: float = 1.6e-6,
+        max_steps: int = 30_000,
+        delay_steps: int = 0,
+        delay_mult: float = 0.01,
+    ) -> None:
+        self.init, self.final, self.max_steps = init, final, max_steps
+        self.delay_steps, self.delay_mult = delay_steps, delay_mult
+
+    def rate(self, step: int, extent: float) -> float:
+        """The step size of the means at `step`, world units."""
+        return extent * exponential_lr(
+            step,
+            init=self.init,
+            final=self.final,
+            max_steps=self.max_steps,
+            delay_steps=self.delay_steps,
+            delay_mult=self.delay_mult,
+        )
+
+    def __call__(self, optimizer: SplatOptimizer, scene: Scene, step: int) -> None:
+        optimizer.set_lr("means", self.rate(step, scene.extent))
 
 
 def increase_sh_degree(model: GaussianModel) -> None:

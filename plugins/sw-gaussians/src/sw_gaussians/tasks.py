@@ -9,8 +9,7 @@ At the last step of a stage the two tasks that disturb a picture (densification,
 
 from splatwizard_core.api import GaussianModel, OptimizationParams, Scene, SplatOptimizer, TaskLog
 from sw_gaussians import density
-from sw_gaussians.learning_rate import UpdateLearningRate
-from sw_gaussians.stage import increase_sh_degree
+from sw_gaussians.stage import UpdateLearningRate, increase_sh_degree
 
 __all__ = ["PruneAndDensify", "ResetOpacity", "UpdateLearningRate", "increase_sh_degree"]
 

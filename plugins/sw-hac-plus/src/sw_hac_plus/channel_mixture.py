@@ -1,8 +1,8 @@
 """Context model `channel-mixture`: channels in slices, each with a second Gaussian from the slices before it.
 
-Another context says mean, scale and weight of a first Gaussian for every channel. A small network a slice sees what
-that context says of all channels, and the values of the earlier slices of the same row, and gives a second one; a
-channel is coded under their mixture. Rows do not depend on one another. Source: HAC++ (arXiv 2501.12255), intra-anchor
+Another context gives mean, scale and weight of a first Gaussian for every channel. One small network per slice sees
+these for all channels and the values of the earlier slices of the same row, and gives a second Gaussian; a channel is
+coded under the mixture of both. Rows do not depend on one another. Source: HAC++ (arXiv 2501.12255), intra-anchor
 context; exact form: the exact mode of the codec library.
 """
 
@@ -18,9 +18,9 @@ from sw_codecs.context.integer_mlp import FRACTION, IntegerMlp, to_fixed
 from sw_codecs.context.two_layers import two_layers
 
 LEAK = 41
-"""Slope of the networks below zero, in 1/4096: 0.01 as published, so that integers have it too."""
+"""Slope of the leaky ReLUs below zero, in 1/4096: near the published 0.01, and the same in integers."""
 PARTS = 3
-"""Numbers that a Gaussian of a mixture has for each channel: mean, scale, logit of its weight."""
+"""Outputs per channel: mean, scale and logit of the weight of its second Gaussian."""
 
 
 class ChannelMixture(nn.Module):

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 KINDS = ("full", "tiny", "none")
 AFTER_FEATURES = {"scales": "scalings", "offsets": "offsets"}
-"""Group -> section, of what one Gaussian predicts."""
+"""Section of each group that is coded after the features, under one Gaussian."""
 
 
 def encode(model: HACPlusAnchors, writer: ContainerWriter, settings: FileSettings, plugins: PluginManager) -> None:
@@ -55,7 +55,7 @@ def encode(model: HACPlusAnchors, writer: ContainerWriter, settings: FileSetting
 
 
 def decode(reader: ContainerReader, plugins: PluginManager) -> DecodedAnchors:
-    """Raises BitstreamError for damage, and for a file of mode `float` that another machine wrote."""
+    """Read all sections. Raises BitstreamError for damage, and in mode `float` for a file from another machine."""
     header = hac_codec.read_header(reader)
     shape = header.shape
     channel = _read_channel(reader, shape.features)
@@ -97,7 +97,7 @@ def walk(
 
 
 def mixtures(channel: ChannelMixture | None, mode: Mode, plugins: PluginManager) -> Coders:
-    """Return the entropy model of what two Gaussians predict, if anything is."""
+    """Return the entropy model of mixtures by the type that it takes; none without a channel context."""
     return {} if channel is None else {RowMixture: plugins.entropy_models.load("conditional-mixture")(mode)}
 
 
@@ -121,7 +121,7 @@ def _add_channel(writer: ContainerWriter, channel: ChannelMixture | None) -> Non
 
 
 def _read_channel(reader: ContainerReader, features: int) -> ChannelMixture | None:
-    """The channel context without its weights. Raises BitstreamError."""
+    """Return the channel context that the header describes, without its weights. Raises BitstreamError."""
     kind = reader.text("channel", choices=KINDS)
     if kind == "none":
         return None

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
-from sw_gaussians.choices import Choosing, Moved, OwnCodec
+from sw_gaussians.named_blocks import Choosing, Moved, OwnCodec
 
 from splatwizard_core.api import Params
 from sw_hac.config import FileSettings, HACLearningRates, HACParams, Phases, RateTerm

@@ -51,7 +51,7 @@ class HACPlus(Method):
         return model
 
     def channel(self, generator: torch.Generator) -> ChannelMixture | None:
-        """The channel context. Raises ConfigError if its slices do not make up the features."""
+        """Return a new channel context, None for kind "none". Raises ConfigError unless its slices are the features."""
         config: HACPlusConfig = self.config
         c = config.channel
         if c.kind == "none":

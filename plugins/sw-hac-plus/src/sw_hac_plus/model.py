@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class HACPlusAnchors(HACAnchors):
-    """HACAnchors on a lattice of voxels, with a channel context; the rate of any anchor may switch it off.
+    """HACAnchors on the lattice of voxels, with a channel context; the rate may switch off any anchor, seen or not.
 
     channel             second Gaussian of each feature; None: the grid alone predicts, as in HAC
     anchor_gradient     whether the gradient of all bits of an anchor reaches its masks
@@ -38,7 +38,7 @@ class HACPlusAnchors(HACAnchors):
     def __init__(
         self, *tensors: Tensor, channel: ChannelMixture | None, anchor_gradient: bool = True, **kwargs: Any
     ) -> None:
-        """As HACAnchors."""
+        """Take what HACAnchors takes, and the channel context."""
         super().__init__(*tensors, further=0 if channel is None else tensors[1].shape[1], **kwargs)
         self.channel = None if channel is None else channel.to(self.features)
         self.anchor_gradient = anchor_gradient
@@ -55,13 +55,13 @@ class HACPlusAnchors(HACAnchors):
         return position_codes(positions, self.bounds), positions
 
     def holds(self, positions: Tensor) -> Tensor:
-        """[M] bool: `positions` [M,3] that the file can hold beside the anchors."""
+        """Return [M] bool: `positions` [M,3] that the file can hold beside the anchors."""
         return within_reach(positions, self.anchors, self.voxel_size)
 
     def drawn(
         self, rows: Tensor, found: NeuralGaussians, masks: Tensor | None, extras: dict[str, Any]
     ) -> GaussianInputs:
-        """Masks multiply scales as well as opacities; statistics see the opacity that a masked Gaussian would have."""
+        """Multiply scales by the masks too, and let statistics see the opacity that a masked Gaussian would have."""
         if masks is not None and masks.requires_grad:
             multiplied = fast_masked.masked if fast_enabled() else masked
             found = dataclasses.replace(found, scales=multiplied(found.scales, masks, found.drawn))
@@ -69,5 +69,5 @@ class HACPlusAnchors(HACAnchors):
 
 
 def masked(values: Tensor, masks: Tensor, drawn: Tensor) -> Tensor:
-    """Values [M,C] times the masks [V,k] at `drawn` [M] of them all, which are 1: what is masked is not drawn."""
+    """Multiply values [M,C] by the masks [V,k] at `drawn` [M]: 1, as nothing else is drawn, but with a gradient."""
     return values * masks.reshape(-1).index_select(0, drawn)[:, None]

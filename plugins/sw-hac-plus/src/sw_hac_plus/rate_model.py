@@ -1,7 +1,8 @@
 """The rate model of HAC++: that of HAC, with a second Gaussian of each feature from the channels before it.
 
-The network behind the grid has F further outputs: logits of the weight of its Gaussian. Source: HAC++
-(arXiv 2501.12255), and published facts about the authors' code.
+The network behind the grid has F further outputs: logits of the weight of its Gaussian. `bits_of_numbers` has the
+mixture, `shares` how masks take part in the rate; `rate` takes the form of `fast` where there are kernels, so a change
+of these two is seen with SW_FAST=0. Source: HAC++ (arXiv 2501.12255), and published facts about the authors' code.
 """
 
 from __future__ import annotations
@@ -35,18 +36,24 @@ class HACPlusRateModel(HACRateModel):
     anchor_gradient: bool = True
 
     def rate(self, values: Tensor, forecast: AnchorForecast, masks: Tensor, counted: Tensor) -> tuple[Tensor, Tensor]:
-        """Count the bits of noisy values [S,C]; an anchor whose masks are all 0 has none."""
+        """Count the bits of noisy values [S,C], by kernels where there are some; see `bits`."""
         fits = mixture_bits.fits(self, values, forecast, masks, counted)
         count = mixture_bits.rate if fits else HACPlusRateModel.bits
         return count(self, values, forecast, masks, counted)
 
     def bits(self, values: Tensor, forecast: AnchorForecast, masks: Tensor, counted: Tensor) -> tuple[Tensor, Tensor]:
-        """Count the bits of each number, of features under two Gaussians."""
+        """Count the bits of noisy values [S,C], of features under two Gaussians; those of a masked number are 0.
+
+        Arguments and result as of `HACRateModel.bits`.
+        """
         bits = self.bits_of_numbers(values, forecast) * (self.shares(masks) * counted[:, None])
         return bits.sum(), self.shape.sums(bits.detach())
 
     def shares(self, masks: Tensor) -> Tensor:
-        """[S,C] factors of the bits: whether the anchor is there, for an offset times its mask; with gradient."""
+        """Return factors [S,C] of the bits: 1 where an anchor has a Gaussian, else 0; of an offset times its mask.
+
+        With `anchor_gradient` the gradient of the first is that of the mean mask.
+        """
         mean = masks.mean(dim=1, keepdim=True)
         there = (mean > 0).to(mean)
         if self.anchor_gradient:
@@ -54,7 +61,7 @@ class HACPlusRateModel(HACRateModel):
         return self.shape.joined(there, there, there * masks)
 
     def bits_of_numbers(self, values: Tensor, forecast: AnchorForecast) -> Tensor:
-        """[S,C] bits of noisy values under the grid's Gaussians, of features under the mixture with the channels'."""
+        """Return bits [S,C] of noisy values under the grid's Gaussians, of features under the mixture of both."""
         found, f, smallest = self.read(forecast.outputs), self.shape.features, self.floors.probability
         mean, steps = torch.cat(found.means, dim=1), self.shape.widened(forecast.sample_steps)
         scale = floored(torch.cat(found.scales, dim=1), steps, self.floors)
@@ -86,7 +93,7 @@ class HACPlusRateModel(HACRateModel):
 
 @dataclass(frozen=True)
 class FirstPrediction:
-    """Prediction of the grid for a block of n anchors.
+    """Prediction of the grid for a block of n anchors: all that is known before the first feature is.
 
     groups      distributions and steps by group
     logit       [n,F] of the weight of the grid's Gaussian
@@ -99,7 +106,7 @@ class FirstPrediction:
 
 
 class ExactMixtures:
-    """Integers with 12 fractional bits: means, scales and known features in base steps."""
+    """A HACPlusRateModel in integers with 12 fractional bits: means, scales and known features in base steps."""
 
     def __init__(self, model: HACPlusRateModel, channel: ChannelMixture) -> None:
         """Raises ValueError if a network cannot be evaluated exactly."""
@@ -118,7 +125,7 @@ class ExactMixtures:
         return FirstPrediction(groups, logit, context)
 
     def mixture(self, index: int, columns: slice, first: FirstPrediction, known: Tensor) -> RowMixture:
-        """Mixtures of slice `index`, once the features before it are `known`."""
+        """Return the mixtures of slice `index`, its `columns`, once the features [n,i] before it are `known`."""
         mean, scale, logit = _second(self._channel, index, known, first.context, self._width(index), EXACT_NUMBERS)
         grid, _ = first.groups["features"]
         return RowMixture(
@@ -126,12 +133,12 @@ class ExactMixtures:
         )
 
     def known(self, symbols: Tensor, first: FirstPrediction) -> Tensor:
-        """Decoded features as the networks take them."""
+        """Return integers [n,n_i] of features as the networks of later slices take them: in base steps."""
         return symbols * torch.as_tensor(first.groups["features"][0].step)
 
 
 class FloatMixtures:
-    """Floats of the networks as trained, in units of the values; known features in base steps."""
+    """A HACPlusRateModel in floats: means and scales in units of the values, known features in base steps."""
 
     def __init__(self, model: HACPlusRateModel, channel: ChannelMixture) -> None:
         self._model, self._channel = model, channel
@@ -146,7 +153,7 @@ class FloatMixtures:
         return FirstPrediction(groups, logit, context)
 
     def mixture(self, index: int, columns: slice, first: FirstPrediction, known: Tensor) -> RowMixture:
-        """Mixtures of slice `index`, once the features before it are `known`."""
+        """Return the mixtures of slice `index`, its `columns`, once the features [n,i] before it are `known`."""
         with one_thread():
             width = self._channel.width(index)
             mean, scale, logit = _second(self._channel, index, known, first.context, width, FLOAT_NUMBERS)
@@ -157,7 +164,7 @@ class FloatMixtures:
         )  # fmt: skip
 
     def known(self, symbols: Tensor, first: FirstPrediction) -> Tensor:
-        """Decoded features as the networks take them."""
+        """Return integers [n,n_i] of features as the networks of later slices take them: in base steps."""
         return (symbols * first.groups["features"][1] / self._model.base_steps[0]).to(torch.float32)
 
 

@@ -1,4 +1,4 @@
-"""Training stage of HAC++: that of HAC with a channel context and a rate that prunes."""
+"""Training stage of HAC++: that of HAC with learning rates of its own, and the mean volume of masked Gaussians too."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from splatwizard_core.api import RenderResult
 
 SMALLEST_RATE = 1e-7
-"""Final rate of the masks where lambda is 0."""
+"""Final learning rate of the masks where lambda is 0."""
 
 
 class HACPlusStage(HACStage):
-    """One stage of 30,000 steps."""
+    """One stage of 30,000 steps in the phases of HACStage; `HACPlusRateModel` has the rate that prunes."""
 
     name = "hac-plus"
     opt: HACPlusConfig
@@ -41,7 +41,7 @@ class HACPlusStage(HACStage):
         return {**rates, "channel": self.decay(step, lr.channel_init, lr.channel_final)}
 
     def mean_volume(self, result: RenderResult) -> Tensor:
-        """Mean product of the scales; Gaussians that are masked only count, with a volume of 0."""
+        """Return the mean product of the scales, scalar; masked Gaussians count with a volume of 0."""
         selection = result.extras["anchors"]
         assert result.inputs.scales is not None
         share = len(result.inputs.scales) / (selection.opacities > 0).sum().clamp(min=1)

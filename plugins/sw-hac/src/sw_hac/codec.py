@@ -47,7 +47,7 @@ log = logging.getLogger(__name__)
 Model = TypeVar("Model", bound=HACAnchors)
 
 SECTIONS = {"features": "features", "scales": "scalings", "offsets": "offsets"}
-"""Group -> section."""
+"""Section of each group."""
 LIMITS = {"feature_dim": 256, "hidden": 256, "grid_hidden": 256, "grid_features": 16}
 """Largest value of a size in the header."""
 
@@ -69,7 +69,7 @@ def encode(model: HACAnchors, writer: ContainerWriter, settings: FileSettings, p
 
 
 def decode(reader: ContainerReader, plugins: PluginManager) -> DecodedAnchors:
-    """Raises BitstreamError for damage, and for a file of mode `float` that another machine wrote."""
+    """Read all sections. Raises BitstreamError for damage, and in mode `float` for a file from another machine."""
     header = read_header(reader)
     shape = header.shape
     geometry = read_geometry(reader, plugins, bytes_per_anchor=shape.decoded_bytes)
@@ -98,7 +98,7 @@ class HACHeader:
 
 
 def settled_copy(model: Model, weights: WeightType) -> Model:
-    """A copy on the CPU whose networks predict in the units of the values, with the weights that the file has."""
+    """Return a copy on the CPU whose networks predict in the units of the values, with the weights of the file."""
     if model.phase != ENTROPY:
         log.warning(
             "the model was never trained for its rate (phase '%s'): its file will be large and inexact", model.phase
@@ -145,7 +145,7 @@ def add_grid(writer: ContainerWriter, grid: MixedHashGrid, plugins: PluginManage
 
 
 def read_grid(reader: ContainerReader, features: int, plugins: PluginManager) -> MixedHashGrid:
-    """The hash grid with the signs of the file. Raises BitstreamError."""
+    """Return the hash grid with the signs of the file. Raises BitstreamError."""
     space, planes = (read_integers(reader, key, low=3, high=4096, longest=32) for key in ("grid_space", "grid_planes"))
     log2_space, log2_planes = read_integers(reader, "grid_log2", low=3, high=22, shortest=2, longest=2)
     entries = MixedHashGrid.count(space, planes, features=features, log2_space=log2_space, log2_planes=log2_planes)
@@ -162,7 +162,11 @@ def walk(
     geometry: AnchorGeometry,
     sections: Mapping[str, str] = SECTIONS,
 ) -> None:
-    """Code all groups of each block of anchors, whose distributions their positions give."""
+    """Code all groups of each block of anchors: encoder and decoder go over them in this order.
+
+    predict     gives distributions and steps from the position codes of a block
+    sections    section of each group
+    """
     for rows in attributes.rows:
         code_groups(attributes, predict(geometry.codes[rows]), geometry.masks[rows], rows, sections)
 
@@ -170,7 +174,7 @@ def walk(
 def code_groups(
     attributes: AttributeCoder, predicted: BlockPrediction, masks: Tensor, rows: slice, sections: Mapping[str, str]
 ) -> None:
-    """Code the groups that `sections` names of one block of anchors with `masks` [n,k]."""
+    """Code those groups of one block of anchors, with `masks` [n,k] bool, that `sections` names."""
     for group, section in sections.items():
         # Three coordinates of an offset are there or not together.
         present = masks.repeat_interleave(3, dim=1) if group == "offsets" else None

@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 from sw_anchors.lattice import Margin
 from sw_anchors.params import CodedAnchorLearningRates, CodedAnchorParams
-from sw_gaussians.choices import Choosing, Moved, OwnCodec
+from sw_gaussians.named_blocks import Choosing, Moved, OwnCodec
 
 from splatwizard_core.api import Params
 
@@ -14,7 +14,7 @@ Resolution = Annotated[int, Field(ge=3, le=4096)]
 
 
 SMALLEST_STEP = 1 / 64
-"""Smallest step over its base. The published 1 + tanh t can underflow to 0; the coder's table of steps ends here."""
+"""Smallest predicted step over its base step, where the file's table of steps ends. Paper: 1 + tanh t, down to 0."""
 
 
 class GridSettings(Params):
@@ -86,7 +86,7 @@ class Steps(Params):
 
     @property
     def triple(self) -> tuple[float, float, float]:
-        """Steps in the order of the groups."""
+        """Base steps of features, scales and offsets."""
         return self.features, self.scales, self.offsets
 
 

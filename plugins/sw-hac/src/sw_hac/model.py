@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 class HACAnchors(CodedAnchors):
     """CodedAnchors whose attributes a hash grid and a network predict.
 
-    grid        hash grid over the box of the anchors, signs
-    mlp_grid    from its features to the outputs of `AnchorShape`
-    units       [W] buffer: factors of these outputs
+    grid        binary hash grid over the box of the anchors
+    mlp_grid    from its features to the W outputs of `AnchorShape`: means and deviations, then step logits
+    units       [W] buffer: factors of these outputs; 1 where it predicts values as they are
     """
 
     grid: MixedHashGrid
@@ -46,12 +46,12 @@ class HACAnchors(CodedAnchors):
         generator: torch.Generator,
         **kwargs: Any,
     ) -> None:
-        """As CodedAnchors.
+        """Take what CodedAnchors takes, and the grid.
 
-        grid_hidden width of the network behind it
-        in_steps    the network gives means and deviations in base steps: scales are some hundredths, which one update
-                    of a network that gives them as they are can overturn
-        further     outputs of the network that follow those of `AnchorShape`, for a subclass
+        grid_hidden width of the network `mlp_grid`
+        in_steps    the network predicts means and deviations as multiples of the base steps: scales are some
+                    hundredths, so one update of a network that predicts them as they are can change all of them
+        further     number of outputs that follow those of `AnchorShape`, for a subclass
         """
         super().__init__(*tensors, generator=generator, **kwargs)
         widths = [*self.shape.outputs, further]
@@ -63,9 +63,9 @@ class HACAnchors(CodedAnchors):
 
     @classmethod
     def of_scene(cls, scene: Scene, config: HACParams, generator: torch.Generator, **kwargs: Any) -> HACAnchors:
-        """Put an anchor into every voxel with a start point of the scene; kwargs as of the constructor.
+        """Put an anchor into every voxel with a start point of the scene; `kwargs` go to the constructor.
 
-        Raises SceneError if there is none.
+        Raises SceneError if the scene has no start points.
         """
         if scene.points is None or len(scene.points) == 0:
             raise SceneError(
@@ -86,15 +86,15 @@ class HACAnchors(CodedAnchors):
         return made
 
     def __getstate__(self) -> dict[str, Any]:
-        """A copy works out anew where its anchors lie."""
+        """Leave the places out: a copy computes its own."""
         return {**self.__dict__, "_places": None}
 
     def networks(self) -> dict[str, nn.Module]:
-        """Networks that the file holds, in its order."""
+        """Return the networks that the file holds, by name, in its order."""
         return {name: getattr(self, name) for name in (*self.NETWORKS, "mlp_grid")}
 
     def context_rows(self) -> Context:
-        """Places of the anchors in the cube of the grid, [N,3] in 0..1."""
+        """Return the places [N,3] of the anchors in the cube of the grid, 0..1, as their 16-bit codes give them."""
         codes = self.codes()
         if self._places is None or self._places[0] is not codes:
             self._places = codes, codes.to(self.features) / TOP
@@ -102,12 +102,13 @@ class HACAnchors(CodedAnchors):
 
     @property
     def rate_model(self) -> HACRateModel:
+        """Grid and network as they are now; a subclass with another context model or rate returns its own."""
         base = self.base_steps_like(self.features)
         return HACRateModel(self.grid, self.mlp_grid, self.shape, self.base_steps, base, self.units, self.floors)
 
     @torch.no_grad()
     def fold_units(self) -> None:
-        """Let the network predict in the units of the values, as it does in the file."""
+        """Move `units` into the last layer: the network then predicts in the units of the values, as in the file."""
         _, last = linear_layers(self.mlp_grid)
         last.weight.mul_(self.units[:, None])
         last.bias.mul_(self.units)

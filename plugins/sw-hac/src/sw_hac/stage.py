@@ -1,4 +1,4 @@
-"""Training stage of HAC: that of all anchor methods with a rate, and three phases."""
+"""Training stage of HAC: that of anchor methods with a rate, in three phases, with the rate in the loss."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 
 class HACStage(CodedAnchorStage):
-    """One stage of 30,000 steps in three phases.
+    """One stage of 30,000 steps in three phases: raw values; noise of fixed steps; noise of predicted steps and rate.
 
-    Raw values; noise of fixed steps; noise of predicted steps with the bits in the loss.
+    Pictures, growth and learning rates of anchors: `sw_anchors.stage`.
     """
 
     name = "hac"
@@ -45,10 +45,18 @@ class HACStage(CodedAnchorStage):
             scheduler.register_task(self.at(phases.entropy), self.start_from_statistics)
 
     def start_from_statistics(self, model: HACAnchors) -> None:
-        """Let the network predict from statistics of the values."""
+        """Start the network behind the grid at mean and deviation of the values, see the model's method."""
         model.start_from_statistics()
 
     def extra_loss(self, model: HACAnchors, result: RenderResult, step: int) -> dict[str, Weighted]:
+        """Return the terms of the rate, from the last phase on: bits per number of anchors and grid, and soft masks.
+
+        rate    lambda times the bits per number over a sample of the visible anchors, times their kept share
+        grid    lambda times the bits of all signs over the count of all numbers, N (F + 6 + 3k)
+        masks   its weight times the mean of sigmoid(mask logit)
+
+        Source: HAC (arXiv 2403.14530), section 4.
+        """
         rate: AnchorRate | None = result.extras.get("rate")
         if rate is None:
             return {}
