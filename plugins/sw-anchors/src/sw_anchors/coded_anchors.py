@@ -14,12 +14,12 @@ from torch import Tensor, nn
 from sw_anchors.anchors import AnchorAttributes, AnchorModel
 from sw_anchors.fast import noisy_values as fast_values
 from sw_anchors.fast import replay
-from sw_anchors.forecasts import PredictedRate
 from sw_anchors.lattice import Margin, bounds_of, coded_positions, position_codes
 from sw_anchors.noisy_values import ENTROPY as ENTROPY
 from sw_anchors.noisy_values import FULL as FULL
 from sw_anchors.noisy_values import MASK_THRESHOLD, Noise, NoisyValues, draws, noisy_values
 from sw_anchors.noisy_values import QUANTIZED as QUANTIZED
+from sw_anchors.older_coded_anchors import PredictedRate
 from sw_anchors.rate_model import AnchorRate, Context, Floors, RateModel, Triple, triple
 from sw_codecs.quantizers.binary import SteMask
 from sw_codecs.quantizers.rounding import SteRound

@@ -17,9 +17,9 @@ from splatwizard_core.api import (
     SplatOptimizer,
     TaskLog,
 )
-from sw_gaussians.blame import blame_of_views, draw_views, guilt
 from sw_gaussians.density import budget
 from sw_gaussians.density.budget import Score
+from sw_gaussians.multiview_pruning import draw_views, multiview_error_scores, normalized_scores
 
 
 class DensifyToBudget:
@@ -94,7 +94,7 @@ class PruneByViews:
 
     views           training views that are drawn each time
     min_opacity     fainter Gaussians go
-    most            those whose share of the blame exceeds this go, 0..1 (`blame.guilt`)
+    most            those whose share of the blame exceeds this go, 0..1 (`multiview_pruning.normalized_scores`)
     lambda_dssim, padding   of the photometric loss that a view's pixels are weighted with
 
     Views are drawn as the training draws them, but on the scene's background even where that of a step is random.
@@ -131,11 +131,11 @@ class PruneByViews:
             return
         with torch.no_grad():
             views = draw_views(scene.train, self.views, model.next_split_generator())
-            blame = blame_of_views(
+            blame = multiview_error_scores(
                 model, views, rasterizer, scene.background.to(model.device), clamp=ppl.clamp_render,
                 lambda_dssim=self.lambda_dssim, padding=self.padding,
             )  # fmt: skip
-            stays = (model.opacities >= self.min_opacity) & (guilt(blame) <= self.most)
+            stays = (model.opacities >= self.min_opacity) & (normalized_scores(blame) <= self.most)
             left, before = int(stays.sum()), model.num_rows
             if left == 0:
                 raise EmptyModel(step)

@@ -21,9 +21,9 @@ from splatwizard_core.api import (
     replacing,
     world_shift,
 )
-from sw_gaussians.drawn_as import antialias_of, lost_options
-from sw_gaussians.mapped import mapped
+from sw_gaussians.memory_map import memory_map
 from sw_gaussians.ply_gaussians import MIP_COMMENT, ORIGIN_COMMENT, WORLD_COMMENT, file_parts, parse_gaussians
+from sw_gaussians.render_options import antialias_of, lost_options
 from sw_gaussians.surfels import as_ellipsoids, gaussians_of
 
 log = logging.getLogger(__name__)
@@ -40,7 +40,7 @@ def load_ply(path: str | os.PathLike[str]) -> GaussianModel:
     Any order of properties, any type of number, binary or ASCII, is read; normals and unknown properties are ignored.
     Raises BitstreamError if the file is damaged, SceneError if it cannot be read or is not a 3DGS model.
     """
-    return from_ply(mapped(path), os.fspath(path))
+    return from_ply(memory_map(path), os.fspath(path))
 
 
 def from_ply(data: bytes | memoryview, path: str) -> GaussianModel:

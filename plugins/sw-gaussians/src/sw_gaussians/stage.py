@@ -16,12 +16,12 @@ from splatwizard_core.api import (
     StageContext,
     photometric_loss,
 )
+from sw_gaussians.adam_moments import keep_moments
 from sw_gaussians.averaging import average_of_the_end
 from sw_gaussians.control_tasks import control_task
 from sw_gaussians.fast.fused_adam import FusingOptimizer, offer_updates
 from sw_gaussians.late_batches import AFTER_ALL, SumViews
 from sw_gaussians.learning_rate import UpdateLearningRate
-from sw_gaussians.moments import keep_moments
 from sw_gaussians.sparse_adam import SparseSplatOptimizer
 
 if TYPE_CHECKING:

@@ -28,7 +28,7 @@ OUTLIERS = 0.001
 """Share of the Gaussians that may have more blame than counts as all of it."""
 
 
-def guilt(blame: Tensor) -> Tensor:
+def normalized_scores(blame: Tensor) -> Tensor:
     """Return the blame [N] as a share, 0..1, of that which a thousandth of the Gaussians exceeds.
 
     Of the largest, as in the paper, where fewer than a thousandth have more than the least; elsewhere one outlier
@@ -43,7 +43,7 @@ def guilt(blame: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def blame_of_views(
+def multiview_error_scores(
     model: SplatModel,
     views: Sequence[View],
     rasterizer: Rasterizer,

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 
-def lend(
+def lazy_exports(
     face: str, modules: Mapping[str, str], base: Mapping[str, str] | None = None
 ) -> tuple[list[str], Callable[[str], Any]]:
     """Make `__all__` and `__getattr__` of the module `face`: a package, or a module directly in it.

@@ -9,7 +9,7 @@ import stat
 from splatwizard_core.api import SceneError
 
 
-def mapped(path: str | os.PathLike[str]) -> bytes | memoryview:
+def memory_map(path: str | os.PathLike[str]) -> bytes | memoryview:
     """Return all bytes of a file; they stay mapped as long as anything views them.
 
     Raises SceneError for what cannot be read and for what is no file, such as a pipe, which has no bytes to map.
