@@ -12,11 +12,11 @@ from splatwizard_core.api import InputFile
 from sw_codecs.models.settings import QuantizedSettings
 
 MODES = {"exact": "gaussians-exact", "quantized": "gaussians-quantized"}
-"""Word in the header of a file, and of `codec.mode` in configs of 0.1 -> codec."""
+"""Header value `mode` of a file (and `codec.mode` of 0.1 configs) -> codec."""
 
 
 class ThreeDGSConfig(GaussianTraining):
-    """Everything that can be set for 3DGS."""
+    """Configuration of 3DGS."""
 
     OLDER: ClassVar[Mapping[str, Moved]] = {
         f"codec.{name}": Moved((f"codec.settings.{name}",), field.default, MODES["quantized"])

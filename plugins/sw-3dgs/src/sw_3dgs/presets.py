@@ -1,4 +1,4 @@
-"""Named configurations, and the rate points of the file."""
+"""Presets (named configurations) and rate points of 3DGS."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -1,4 +1,4 @@
-"""Hyper-parameters of methods on anchors. Defaults are those of Scaffold-GS as HAC trains it."""
+"""Hyper-parameters of anchor methods. Defaults are those of Scaffold-GS as HAC trains it."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class AnchorGrowth(Params):
 
     @property
     def whole_voxels(self) -> bool:
-        """Whether cells of all levels are whole voxels, so that `subvoxel` changes nothing."""
+        """Whether cells of all levels are whole voxels, which makes `subvoxel` irrelevant."""
         return all(self.init_factor % self.hierarchy**level == 0 for level in range(self.levels))
 
     def normal(self, plugins: Any) -> AnchorGrowth:
@@ -91,7 +91,7 @@ class AnchorLoss(Params):
 
 
 class AnchorParams(OptimizationParams):
-    """Hyper-parameters of a method on anchors, to be subclassed."""
+    """Base of the hyper-parameters of an anchor method."""
 
     voxel_size: float = Field(0.001, description="edge of an anchor's cell, world units; <= 0: from the points")
     num_offsets: int = Field(10, ge=1, le=64, description="Gaussians an anchor can spawn")

@@ -1,7 +1,7 @@
-"""Rate models: what predicts how attributes of anchors are distributed, in training and for the file alike.
+"""Rate models: predicted distributions of anchor attributes, for the training rate and for the file.
 
 One object, built from the same grids and networks, gives the bits of a sample in training (`rate`) and the integer
-distributions of the file (`exact`): so what is trained is what is coded.
+distributions of the file (`exact`), so that training minimises the size that is coded.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ Triple = tuple[Tensor, Tensor, Tensor]
 Context = tuple[Tensor, ...]
 """Tensors with a row per anchor, without gradients: what a rate model predicts from, known before any attribute."""
 Rows: TypeAlias = "Tensor | slice"
-"""Some rows of a context: int64 numbers, or all from one on."""
+"""Rows of a context: int64 indices, or a slice to the end."""
 
 SMALLEST_SCALE = 1e-9
-"""Floor of a predicted deviation, as published."""
+"""Lower bound of a predicted standard deviation, as published."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class AnchorForecast:
 
 @dataclass(frozen=True)
 class Floors:
-    """Floors of a rate in training.
+    """Lower bounds in the training rate.
 
     probability     of a value
     scale           of a predicted deviation, in quantiser steps; the gradient that would raise one from below passes.
@@ -59,7 +59,7 @@ PUBLISHED_FLOORS = Floors()
 
 
 class RateModel(Protocol):
-    """Distributions of the attributes of anchors.
+    """Protocol of rate models.
 
     A method's own class holds its grids and networks. `CodedAnchors.rate_model` gives it in training, the encoder asks
     the trained model for it, and the decoder builds it from the file.
@@ -82,7 +82,7 @@ class RateModel(Protocol):
         ...
 
     def exact(self) -> object:
-        """Return the same distributions in integers, equal on every machine: what the method's file is coded with."""
+        """Return the same distributions in integers, identical on every machine, for coding the file."""
         ...
 
 
@@ -117,7 +117,7 @@ class AnchorRate:
 
     @classmethod
     def of(cls, bits: Tensor, by_group: Tensor, numbers: Tensor, forecast: AnchorForecast) -> AnchorRate:
-        """Return the rate of a sample of so many bits and numbers."""
+        """Return the rate of a sample from its bits and its count of numbers."""
         return cls(bits / numbers.clamp(min=1), by_group, numbers, forecast.own_bits)
 
 
@@ -166,7 +166,7 @@ def _shape(values: Tensor, masks: Tensor) -> AnchorShape:
 
 
 def floored(scale: Tensor, steps: Tensor, floors: Floors) -> Tensor:
-    """Keep predicted deviations [S,C] to their floor, for quantiser steps [S,C]; differentiable.
+    """Clamp predicted standard deviations [S,C] from below, for quantiser steps [S,C]; differentiable.
 
     Of a column whose deviations are all at SMALLEST_SCALE no value lies where a gradient would tell: none learns.
     """

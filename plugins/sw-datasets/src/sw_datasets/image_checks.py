@@ -1,4 +1,4 @@
-"""The gate that the pictures of every scene pass: size against camera, EXIF turns, alpha and masks.
+"""Checks that the pictures of every scene pass: size against camera, EXIF turns, alpha and masks.
 
 A loader asks it for each view; what was found stands in `warnings` once all views are made.
 """

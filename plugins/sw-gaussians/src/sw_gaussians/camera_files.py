@@ -1,4 +1,4 @@
-"""Files of cameras: `cameras.json` as the code of 3DGS writes it, and camera paths of nerfstudio's viewer."""
+"""Camera files: `cameras.json` of the 3DGS code, and camera paths of the nerfstudio viewer."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ LARGEST_FILE = 64 << 20  # bytes; a camera takes 400
 MOST_CAMERAS = 100_000
 LARGEST_SIDE = 16_384  # pixels
 LOOSE = 1e-2
-"""By how much entries of R R^T may differ from the identity: files have few digits. R is then made exact."""
+"""Tolerance per entry of R R^T - I: files store few digits. R is orthonormalised afterwards."""
 
 
 @dataclass(frozen=True)
 class CameraFile:
-    """Cameras of a file in its order, and the frames a second that it asks for, or None."""
+    """Cameras in file order, and the frames per second that the file asks for, or None."""
 
     cameras: list[Camera]
     fps: float | None = None
@@ -101,7 +101,7 @@ def _camera(
 
 
 def _rotation(matrix: NDArray[np.float64], place: str) -> NDArray[np.float64]:
-    """The rotation next to a matrix that nearly is one. Raises SceneError for another matrix."""
+    """Return the nearest rotation [3,3] of a nearly orthonormal matrix. Raises SceneError for any other matrix."""
     if abs(matrix @ matrix.T - np.eye(3)).max() > LOOSE or np.linalg.det(matrix) <= 0:
         raise SceneError(f"{place} is no rotation")
     u, _, v = np.linalg.svd(matrix)

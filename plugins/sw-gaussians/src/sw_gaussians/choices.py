@@ -1,4 +1,4 @@
-"""The parts of a method that a user may exchange: a codec or a pruner, by name, with the settings of who provides it.
+"""Exchangeable parts of a method: a codec or a pruner chosen by name, with the settings of its package.
 
 A config asks for one with a block, `codec: CodecChoice` or one of its own that extends `PrunerChoice`, and is itself a
 `Choosing`. Then `--set codec=NAME` and `--set codec.settings.KEY=VALUE` work, for a stranger's codec too: keys, types
@@ -23,7 +23,7 @@ ExchangeableT = TypeVar("ExchangeableT", bound="Exchangeable")
 
 
 class Named(Params):
-    """Block whose name alone may stand for it: `codec = "NAME"` for `codec.name = "NAME"`.
+    """Configuration block with a name: `codec = "NAME"` is short for `codec.name = "NAME"`.
 
     NAME    field that holds the name
     """
@@ -37,7 +37,7 @@ class Named(Params):
 
     @property
     def chosen(self) -> str:
-        """Name that stands in it."""
+        """Name of the chosen class."""
         found: str = getattr(self, self.NAME)
         return found
 
@@ -51,7 +51,7 @@ class OwnCodec(Named):
 
 
 class Choice(Named):
-    """Provider of a kind, by name, and its settings: a subclass has a field for the name and `settings`, a dict.
+    """Base of blocks that choose a registered class: a field for its name, and `settings`, a dict.
 
     REGISTRY    attribute of the plugin manager that knows the names
     PARTS       further fields with settings, each for a part of the work alone; they win over `settings`
@@ -128,14 +128,14 @@ class Choice(Named):
         return {f"{path}.settings.{name}": field.description or "" for name, field in fields.items()}
 
     def normal(self: ChoiceT, plugins: PluginManager) -> ChoiceT:
-        """Return this with those settings alone that differ from the provider's defaults."""
+        """Return this with only the settings that differ from the provider's defaults."""
         model = self._model(plugins, self.NAME)
         settings = {} if model is None else given_values(model.model_validate(self.model_dump()["settings"]), plugins)
         return super().normal(plugins).model_copy(update={"settings": settings})
 
 
 class CodecChoice(Choice):
-    """Codec of whole Gaussian models; the default of `name` is the method's to say."""
+    """Codec of whole Gaussian models; each method sets the default of `name`."""
 
     REGISTRY: ClassVar[str] = "gaussian_codecs"
 
@@ -149,7 +149,7 @@ class CodecChoice(Choice):
 
 
 class PrunerChoice(Choice):
-    """Pruner; a block of a method extends it by when and how much it removes."""
+    """Pruner; a method's subclass adds when and how much it removes."""
 
     REGISTRY: ClassVar[str] = "pruners"
     NAME: ClassVar[str] = "pruner"
@@ -170,7 +170,7 @@ class PrunerChoice(Choice):
 
 
 class Moved(NamedTuple):
-    """New place of a key of an older release.
+    """New key that replaces a key of an older release.
 
     keys        one or several; none: it is gone
     default     value that the older release had; a key that is gone is refused with another one, if this is not None
@@ -198,7 +198,7 @@ class Exchangeable(OptimizationParams):
     OLDER: ClassVar[Mapping[str, Moved]] = {}
 
     def spelled(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return values by dotted key with today's keys.
+        """Return values by dotted key, with older keys replaced by current ones.
 
         A name alone, `codec=NAME`, stands for the key of the name. Settings of another provider than the one named so
         far are gone. Keys of `OLDER` become those of today.
@@ -259,7 +259,7 @@ class Choosing(Exchangeable):
 
 
 def _blocks(config: BaseModel) -> Iterator[tuple[str, Named]]:
-    """Yield key and value of each block with a name."""
+    """Yield key and value of each `Named` block."""
     for name in type(config).model_fields:
         block = getattr(config, name)
         if isinstance(block, Named):

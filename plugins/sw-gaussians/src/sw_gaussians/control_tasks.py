@@ -1,4 +1,4 @@
-"""Lines of a density control's plan as schedule tasks."""
+"""Schedule tasks that call the actions of a density control."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Action = Callable[..., Mapping[str, int] | None]
 
 
 class ControlTask:
-    """Does something with a density control, and records the curves that it reports.
+    """Calls an action of a density control and records the curves that it reports.
 
     At the last step of a stage nothing happens: no update follows that could repair a picture. A full run ends long
     after the last densification and opacity reset; a run that is cut short to a multiple of 100 would lose about 0.8 dB
@@ -31,14 +31,14 @@ class ControlTask:
 
 
 class Collect(ControlTask):
-    """Collects statistics of a drawing, which leaves the model and all gradients alone."""
+    """Collects statistics of a render; changes neither the model nor any gradient."""
 
     def __call__(self, state: TrainingState) -> None:
         self.do(state, state.result)
 
 
 class Adjust(ControlTask):
-    """Adjusts which primitives there are; its state in checkpoints is that of the control."""
+    """Adds and removes primitives; its checkpoint state is that of the control."""
 
     def __init__(self, do: Action, control: DensityControl) -> None:
         super().__init__(do)
@@ -52,7 +52,7 @@ class Adjust(ControlTask):
 
 
 class Change(ControlTask):
-    """Changes values of the primitives that there are, such as their opacities."""
+    """Changes values of existing primitives, such as their opacities."""
 
 
 def control_task(do: Action, control: DensityControl, adjust: Action) -> ControlTask:

@@ -1,4 +1,4 @@
-"""The schedule tasks of fast training, by name, for stages that have a plan of their own.
+"""Schedule tasks of fast training (budget densification, opacity halving, multi-view pruning).
 
 As those of `tasks`, they change nothing at the last step of a stage: no update follows that could repair it.
 """
@@ -79,7 +79,7 @@ class DensifyToBudget:
 
 
 class HalveOpacity:
-    """Halves every opacity, down to `floor`, and lets Adam start afresh (sw_gaussians.density.budget.halve_opacity)."""
+    """Halves every opacity, down to `floor`, and resets Adam's state (sw_gaussians.density.budget.halve_opacity)."""
 
     def __init__(self, *, floor: float = budget.OPACITY_FLOOR) -> None:
         self.floor = floor
@@ -90,11 +90,11 @@ class HalveOpacity:
 
 
 class PruneByViews:
-    """Removes Gaussians that are faint, or that several views blame for their badly drawn pixels.
+    """Removes Gaussians that are nearly transparent, or that cover badly rendered pixels in several views.
 
     views           training views that are drawn each time
     min_opacity     fainter Gaussians go
-    most            those whose share of the blame exceeds this go, 0..1 (`multiview_pruning.normalized_scores`)
+    most            prune Gaussians whose score exceeds this, 0..1 (`multiview_pruning.normalized_scores`)
     lambda_dssim, padding   of the photometric loss that a view's pixels are weighted with
 
     Views are drawn as the training draws them, but on the scene's background even where that of a step is random.

@@ -48,7 +48,7 @@ class UpdateLearningRate:
         self.delay_steps, self.delay_mult = delay_steps, delay_mult
 
     def rate(self, step: int, extent: float) -> float:
-        """The step size of the means at `step`, world units."""
+        """Return the learning rate of the means at `step`, world units."""
         return extent * exponential_lr(
             step,
             init=self.init,
@@ -63,11 +63,11 @@ class UpdateLearningRate:
 
 
 SHORT, LONG = 0.4, 0.8
-"""Shares of the full plan up to which a run counts as short, and from which as long."""
+"""Bounds, as shares of the full schedule: shorter runs count as short, longer ones as long."""
 
 
 def rate_factors(share: float) -> dict[str, float]:
-    """Return by what two learning rates of the full plan are multiplied in a run of a share of its steps, > 0.
+    """Return the factors of two learning rates in a run of a given share, > 0, of the full schedule.
 
     A short run ends with larger steps of the means, for they have less time to arrive; up to a long one the factor is
     log-interpolated. SH bands 1 to 3 move twice as fast in all that is not long.

@@ -1,4 +1,4 @@
-"""Learning rates that fall at the end of a training: what one view at a time leaves unsettled comes to rest."""
+"""Learning-rate decay of all parameter groups at the end of a training."""
 
 from collections.abc import Mapping
 
@@ -6,7 +6,7 @@ from splatwizard_core.api import SplatOptimizer
 
 
 class SettleLearningRates:
-    """Lowers learning rates log-linearly between two steps.
+    """Decays learning rates log-linearly between two steps.
 
     rates   parameter group -> its rate until `first`; groups that the optimizer lacks are left out
     first   step up to which the rates are whole
@@ -26,7 +26,7 @@ class SettleLearningRates:
         self.rates, self.first, self.last, self.factor = dict(rates), first, last, factor
 
     def share(self, step: int) -> float:
-        """Return by what the rates are multiplied at a step."""
+        """Return the factor of the learning rates at a step."""
         passed = min(max((step - self.first) / (self.last - self.first), 0.0), 1.0)
         return float(self.factor**passed)
 

@@ -1,4 +1,4 @@
-"""Density control of 3DGS-MCMC as schedule tasks, for this method and, by name, for others.
+"""Schedule tasks of 3DGS-MCMC density control, registered by name for any method.
 
 Every draw comes from a stream that is named after the step, so there is no state to save: a run that resumes at a step
 draws what the uninterrupted one drew there. At the last step nothing is moved: no update follows that could repair it.
@@ -43,7 +43,7 @@ class Grow:
 
 
 class AddNoise:
-    """Shakes the means after each update (sw_gaussians.density.mcmc.add_noise).
+    """Adds noise to the means after each update (sw_gaussians.density.mcmc.add_noise).
 
     A pre task: what follows the update of step s - 1 happens at the start of step s, and before the task that sets the
     step size, so that it is still that of s - 1. Register it before "update lr".

@@ -1,4 +1,4 @@
-"""PSNR of two renders as tables tell it: finite for equal pictures, an error for pictures that are no numbers."""
+"""PSNR of two renders for tables: capped for equal images, an error for non-finite ones."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 from splatwizard_core.api import UserInputError, psnr
 
 MOST_PSNR = 100.0
-"""Told of pictures that are equal, dB: that of an error of 1e-5."""
+"""PSNR of equal images, dB; equals an RMS error of 1e-5."""
 
 
 def capped_psnr(a: Tensor, b: Tensor) -> float:

@@ -1,4 +1,4 @@
-"""The training stage of 3DGS: the one that other methods start from, extend, or take over whole."""
+"""The training stage of 3DGS, which other methods extend or wrap."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 
 def increase_sh_degree(model: GaussianModel) -> None:
-    """Draw and train one more band of spherical harmonics, up to the model's own degree."""
+    """Activate one more SH band, up to the model's maximum degree."""
     model.active_sh_degree = min(model.active_sh_degree + 1, model.max_sh_degree)
 
 
@@ -109,7 +109,7 @@ class ThreeDGSStage(Stage):
 
     @functools.cached_property
     def settled(self) -> int:
-        """Step of this run at which density control ends."""
+        """Last step of this run with density control."""
         return self.steps(self.control.until)
 
     def begin(self, context: StageContext) -> SplatModel:
@@ -143,7 +143,7 @@ class ThreeDGSStage(Stage):
         return self._optimizer
 
     def finish(self, model: SplatModel, scene: Scene) -> SplatModel:
-        """Return the model, with Adam's moments beside it for whoever goes on from here."""
+        """Return the model, with Adam's moments attached for a following stage."""
         if self._optimizer is not None and self._optimizer.model is model:
             keep_moments(model, self._optimizer)
         self._optimizer = None
@@ -182,7 +182,7 @@ class ThreeDGSStage(Stage):
             scheduler.register_task(every if when is None else self.when(when), task, name=name)
 
     def adjust(self, state: TrainingState) -> DensityReport:
-        """Let the control add and remove Gaussians; a stage with rules of its own does more."""
+        """Let the density control add and remove Gaussians; subclasses may add rules."""
         return self.control.adjust(state)
 
     def raster_options(self, step: int, background: Tensor) -> RasterOptions:

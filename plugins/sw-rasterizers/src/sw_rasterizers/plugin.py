@@ -3,7 +3,7 @@
 from splatwizard_core.api import Registry, hookimpl
 
 PROFILES = ["3dgs", "dgr-exact"]
-"""Exact support of every splat; or the original's tiles and gradients."""
+"""Profiles: `exact` splat support, or tiles and gradients as in the original 3DGS."""
 
 STANDARD_FEATURES = [
     "BACKWARD", "ANTIALIAS", "ABSGRAD", "VISIBLE_FILTER", "COV3D", "COLORS_ND", "EXTRA_FEATURES", "SPLIT_SH",

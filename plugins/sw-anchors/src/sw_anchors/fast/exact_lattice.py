@@ -1,4 +1,4 @@
-"""An exact context network and the lattice of the coder by one kernel: no means or scales in between."""
+"""Exact context network and coder lattice in one kernel, without intermediate means and scales."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from sw_codecs.exact_native import EXACT
 
 
 class Network(Protocol):
-    """Members of an ExactNetwork that are read here."""
+    """Protocol of the ExactNetwork members read here."""
 
     network: IntegerMlp
     shape: AnchorShape

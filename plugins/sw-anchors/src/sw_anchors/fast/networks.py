@@ -1,4 +1,4 @@
-"""Outputs of the three networks of anchors for a view: one node of the graph of derivatives.
+"""The three anchor networks of a view as one autograd node.
 
 A step of training is bound by how many operators the host has to launch, not by what they compute: the first layers of
 all three are one product, and the gradient is written down (benchmarks/train_anchors.py).
@@ -17,7 +17,7 @@ from sw_anchors.native import ANCHORS
 from sw_anchors.neural_gaussians import Networks
 
 MOST_FEATURES, MOST_HIDDEN, MOST_OUTPUTS, BLOCK_BYTES = 51, 51, (16, 80, 32), 164_352
-"""That the CUDA kernel has room for, and the shared memory of its blocks: see kernels/cuda/networks.h."""
+"""Size limits of the CUDA kernel, and its shared memory per block: see kernels/cuda/networks.h."""
 
 
 def network_outputs(
@@ -108,5 +108,5 @@ class _Outputs(torch.autograd.Function):
 
 
 def _aligned(part: Tensor) -> Tensor:
-    """The same with the alignment that the optimizer's kernel asks for (16 bytes), which rows of a matrix may lack."""
+    """Return the tensor 16-byte aligned, as the optimizer's kernel needs; rows of a matrix may not be."""
     return part if part.data_ptr() % 16 == 0 else part.clone()

@@ -1,4 +1,4 @@
-"""Drawn pictures kept on disk, so that the demo scene is drawn once on a machine and not once a run."""
+"""Disk cache of rendered pictures: the demo scene is rendered once per machine, not once per run."""
 
 from __future__ import annotations
 
