@@ -26,7 +26,7 @@ THICKNESS = 1e-8
 
 @dataclass(frozen=True)
 class Surface:
-    """How a model's surface was trained, which decides how depth is read from it.
+    """Settings with which a model's surface was trained; they decide how its depth is read.
 
     depth_ratio     r of `sw_gaussians.surface.surface_depth`, 0..1
     lambda_dist     weight of the distortion, >= 0

@@ -15,7 +15,7 @@ from sw_rasterizers.standard import StandardRasterizer
 
 
 class InferenceRasterizer(StandardRasterizer):
-    """Base of both rasterizers. Images are [3,H,W], float32, or uint8 with `dtype_out="uint8"`: round(255 clamp(x, 0, 1)).
+    """Base of both. Images are [3,H,W], float32, or uint8 with `dtype_out="uint8"`: round(255 clamp(x, 0, 1)).
 
     A pixel draws the splat that brings its transmittance below 1e-4 (the standard rasterizers leave it out) and goes on
     until all 32 pixels of its warp are below. Alpha is still clamped at 0.99 and cut below 1/255.

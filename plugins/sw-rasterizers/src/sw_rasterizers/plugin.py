@@ -3,7 +3,7 @@
 from splatwizard_core.api import Registry, hookimpl
 
 PROFILES = ["3dgs", "dgr-exact"]
-"""Profiles: `exact` splat support, or tiles and gradients as in the original 3DGS."""
+"""Profiles: `3dgs` has exact splat support, `dgr-exact` the tiles and gradients of the original code."""
 
 STANDARD_FEATURES = [
     "BACKWARD", "ANTIALIAS", "ABSGRAD", "VISIBLE_FILTER", "COV3D", "COLORS_ND", "EXTRA_FEATURES", "SPLIT_SH",

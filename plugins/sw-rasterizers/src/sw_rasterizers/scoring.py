@@ -12,7 +12,7 @@ from sw_rasterizers.ops import Call
 KINDS = ("hits", "opacity", "opacity_T", "blend", "blend_max", "gamma", "dist", "grad_sq")
 """Score kinds, in the order of `enum ScoreKind` in csrc/scores.h."""
 MAX_SCORES = 16
-"""Largest number of scores per call; `kMaxScores` there."""
+"""Largest number of scores per call; `kMaxScores` of csrc/scores.h."""
 FISHER = 21
 """Length of a Fisher block: upper triangle of 6x6, row by row."""
 
