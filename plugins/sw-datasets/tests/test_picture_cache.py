@@ -103,13 +103,13 @@ def test_a_damaged_file_is_drawn_again_and_mended(folder, spoil):
 
 def test_the_oldest_make_room_and_the_size_stays_bounded(folder, monkeypatch):
     one = picture_cache.DIGEST_BYTES + 18
-    monkeypatch.setattr(picture_cache, "MOST_BYTES", 3 * one)
+    monkeypatch.setattr(picture_cache, "MAX_BYTES", 3 * one)
     for i, name in enumerate("abcde"):
         picture_cache.kept_or_drawn(name, SHAPE, lambda: pixels(1))
         os.utime(folder / name, (i, i))
     assert {file.name for file in folder.iterdir()} == set("cde")
     assert sum(file.stat().st_size for file in folder.iterdir()) == 3 * one
-    monkeypatch.setattr(picture_cache, "MOST_BYTES", one - 1)
+    monkeypatch.setattr(picture_cache, "MAX_BYTES", one - 1)
     assert (
         picture_cache.kept_or_drawn("f", SHAPE, lambda: pixels(6)) == 6
     ).all()  # too large to keep, and nothing is removed

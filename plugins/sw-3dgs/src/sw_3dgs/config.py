@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 from pydantic import Field
 from sw_gaussians.choices import CodecChoice, Moved
 from sw_gaussians.config import GaussianTraining
-from sw_gaussians.fast.fused_adam import FUSED_FROM
+from sw_gaussians.fast.fused_adam import MIN_FUSED_GAUSSIANS
 
 from splatwizard_core.api import InputFile
 from sw_codecs.models.settings import QuantizedSettings
@@ -31,7 +31,7 @@ class ThreeDGSConfig(GaussianTraining):
     fused_updates: bool | None = Field(
         None,
         description="on CUDA, update spherical harmonics in the backward pass, equal but for rounding; None: from "
-        f"{FUSED_FROM:,} Gaussians on, where it is faster",
+        f"{MIN_FUSED_GAUSSIANS:,} Gaussians on, where it is faster",
     )
     codec: CodecChoice = Field(CodecChoice(name="gaussians-exact"), description="what writes the file")
 

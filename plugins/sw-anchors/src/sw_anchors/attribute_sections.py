@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from splatwizard_core.api import BitstreamError
 from sw_anchors.fast import exact_lattice
-from sw_anchors.row_parts import EXACT_NUMBERS, parts_of
+from sw_anchors.row_parts import MAX_EXACT_NUMBERS, parts_of
 from sw_anchors.shape import GROUPS, AnchorShape
 from sw_codecs.context.integer_mlp import FRACTION, IntegerMlp
 from sw_codecs.entropy.exact_tables import step_multipliers
@@ -195,7 +195,7 @@ class ExactNetwork:
         """Return network outputs, int64 [n, sum(shape.outputs) + further]; arguments as in a call."""
         outputs = torch.empty(len(places), self.network.outputs, dtype=torch.int64)
         start = 0
-        for part in parts_of(places, width, EXACT_NUMBERS):
+        for part in parts_of(places, width, MAX_EXACT_NUMBERS):
             self.network(features(part), out=outputs[start : start + len(part)])
             start += len(part)
         return outputs

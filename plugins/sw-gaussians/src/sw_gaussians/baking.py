@@ -34,15 +34,15 @@ if TYPE_CHECKING:
 
 BLEND = ScoreSpec("blend", "blend")
 """Name of the score that weights views: sum over pixels of alpha times transmittance."""
-FAINTEST = 1 / 255
+MIN_OPACITY = 1 / 255
 """Opacity below which a Gaussian is not drawn."""
-OPAQUE = 1 - 1e-5
+MAX_OPACITY = 1 - 1e-5
 """Largest opacity; an opacity of 1 has no finite logit."""
-UNSEEN = 1e-3
+HIDDEN_VIEW_WEIGHT = 1e-3
 """Weight, in pixels, of a view in which a Gaussian is hidden; it matters only if all views hide it."""
 RIDGE = 0.005
 """Ridge regularisation of the higher SH bands, as a share of the total view weight."""
-AT_ONCE = 1 << 15
+SOLVE_BATCH = 1 << 15
 """Number of Gaussians whose least-squares systems are solved per call."""
 
 
@@ -95,7 +95,7 @@ def bake(
         fit = _Fit(means, slots, sh_degree)
         for view in views():
             blend = rasterizer.render(guess, view.camera, blending).scores[BLEND.name]
-            fit.add(view, blend / guess.opacities.clamp_min(FAINTEST) + UNSEEN)
+            fit.add(view, blend / guess.opacities.clamp_min(MIN_OPACITY) + HIDDEN_VIEW_WEIGHT)
         found = fit.shapes()
         return _model(replace(found, sh=SH(dense=fit.harmonics())))
 
@@ -174,7 +174,7 @@ class _Fit:
         assert inputs.quats is not None
         opacities = inputs.opacities[known]
         seen = weights.clone()
-        seen[rows] = seen[rows].clamp_min(UNSEEN)
+        seen[rows] = seen[rows].clamp_min(HIDDEN_VIEW_WEIGHT)
         self._weight += seen
         shown = seen[rows] * opacities  # [M] what of it is in the picture
         self._opacity[rows] += shown
@@ -191,7 +191,7 @@ class _Fit:
     def shapes(self) -> GaussianInputs:
         """Return grey Gaussians whose opacity, scale and rotation are the weighted means over the views."""
         shown = self._opacity.clamp_min(1e-20)[:, None]
-        opacities = (self._opacity / self._weight.clamp_min(1e-20)).clamp(0, OPAQUE)
+        opacities = (self._opacity / self._weight.clamp_min(1e-20)).clamp(0, MAX_OPACITY)
         quats = normalize(self._quats, dim=1)
         return GaussianInputs(
             self.means, opacities, (self._log_scales / shown).exp(), quats, colors=torch.full_like(self.means, 0.5)
@@ -204,7 +204,9 @@ class _Fit:
         ridge[0] = 1e-6
         found = []
         for products, colors in zip(
-            (self._products / shown).split(AT_ONCE), (self._colors / shown[:, :, None]).split(AT_ONCE), strict=True
+            (self._products / shown).split(SOLVE_BATCH),
+            (self._colors / shown[:, :, None]).split(SOLVE_BATCH),
+            strict=True,
         ):
             matrix = products.new_zeros(len(products), self._terms, self._terms)
             matrix[:, self._upper[0], self._upper[1]] = products
@@ -218,7 +220,7 @@ def _model(g: GaussianInputs) -> GaussianModel:
     assert g.sh is not None
     assert g.scales is not None
     assert g.quats is not None
-    kept = g.opacities >= FAINTEST
+    kept = g.opacities >= MIN_OPACITY
     if not kept.any():
         raise SceneError("no Gaussian is opaque enough to be drawn, so there is nothing to bake")
     sh = g.sh.to_dense()[kept]

@@ -17,7 +17,7 @@ from splatwizard_core.api import Camera, SceneError
 LARGEST_FILE = 64 << 20  # bytes; a camera takes 400
 MOST_CAMERAS = 100_000
 LARGEST_SIDE = 16_384  # pixels
-LOOSE = 1e-2
+ROTATION_TOLERANCE = 1e-2
 """Tolerance per entry of R R^T - I: files store few digits. R is orthonormalised afterwards."""
 
 
@@ -102,7 +102,7 @@ def _camera(
 
 def _rotation(matrix: NDArray[np.float64], place: str) -> NDArray[np.float64]:
     """Return the nearest rotation [3,3] of a nearly orthonormal matrix. Raises SceneError for any other matrix."""
-    if abs(matrix @ matrix.T - np.eye(3)).max() > LOOSE or np.linalg.det(matrix) <= 0:
+    if abs(matrix @ matrix.T - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(matrix) <= 0:
         raise SceneError(f"{place} is no rotation")
     u, _, v = np.linalg.svd(matrix)
     nearest: NDArray[np.float64] = u @ v

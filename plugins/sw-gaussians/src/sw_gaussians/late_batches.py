@@ -4,7 +4,7 @@ from splatwizard_core.api import SplatModel, SplatOptimizer
 
 PENDING = "pending"
 """Key in the optimizer state: gradient sum since the last update, same shape as the parameter."""
-AFTER_ALL = 100
+LAST_PRIORITY = 100
 """Priority behind all tasks that read or change gradients."""
 
 
@@ -13,7 +13,7 @@ class SumViews:
 
     last    step that updates with what there is by then, be it fewer views; None: what is left is lost
 
-    A post task, to be registered with priority `AFTER_ALL`. The sums are part of the optimizer's state: they follow
+    A post task, to be registered with priority `LAST_PRIORITY`. The sums are part of the optimizer's state: they follow
     rows that come, go or are put in another order, and are in checkpoints. Adam does not see the factor between a sum
     and a mean, so learning rates stay as they are.
     Source: FastGS (arXiv 2511.04283). Raises ValueError for less than one view.

@@ -24,7 +24,7 @@ from splatwizard_core.api import (
 
 LOSS_THRESHOLD = 0.1
 """Normalised error (0..1 within a view) above which a pixel counts as badly rendered."""
-OUTLIERS = 0.001
+OUTLIER_SHARE = 0.001
 """Share of the Gaussians whose scores are clipped to 1."""
 
 
@@ -37,7 +37,7 @@ def normalized_scores(blame: Tensor) -> Tensor:
     blame = blame.nan_to_num(0.0, 0.0, 0.0)
     low, most = blame.aminmax()
     # Not torch.kthvalue, which a GPU refuses where algorithms must be deterministic.
-    high = blame.sort().values[math.ceil((1 - OUTLIERS) * len(blame)) - 1]
+    high = blame.sort().values[math.ceil((1 - OUTLIER_SHARE) * len(blame)) - 1]
     high = torch.where(high > low, high, most)
     return ((blame - low) / (high - low).clamp_min(1e-30)).clamp_(0, 1)
 

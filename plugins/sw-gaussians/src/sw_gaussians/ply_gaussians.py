@@ -26,7 +26,7 @@ MIP_COMMENT = "SplatRenderMode: mip"
 ORIGIN_COMMENT, WORLD_COMMENT = "world_origin", "world_coordinates"
 """Words of comments with three numbers: where the origin of the coordinates lies in the world of the scene; of the
 second the coordinates are those of the world, and the numbers say about which origin they can be held in float32."""
-FAR_OUT = 1e4
+MAX_OFFSET_RATIO = 1e4
 """Distance from 0, in model sizes, beyond which float64 coordinates get a local origin."""
 _ROWS_AT_ONCE = 1 << 13  # 2 MB of rows: they stay in the processor's cache
 
@@ -132,7 +132,7 @@ def _means(vertex: Table, comments: Sequence[str], notes: list[str]) -> tuple[Ar
     if origin is None and told[ORIGIN_COMMENT] is None and doubles and len(vertex):
         middle = [float(np.median(vertex[axis])) for axis in "xyz"]
         size = max(float(np.median(np.abs(vertex[axis] - at))) for axis, at in zip("xyz", middle, strict=True))
-        if math.isfinite(sum(middle)) and math.hypot(*middle) > FAR_OUT * max(size, 1e-9):
+        if math.isfinite(sum(middle)) and math.hypot(*middle) > MAX_OFFSET_RATIO * max(size, 1e-9):
             origin = (round(middle[0]), round(middle[1]), round(middle[2]))
             notes.append(f"its coordinates lie far from 0 and are moved to a local origin at {origin}")
     if origin is None:

@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
 LEVELS = 32
 """Number of resolution levels between the first and the full resolution."""
-HALVINGS = 24
+BISECTION_STEPS = 24
 """Bisection steps of the search for a scale: finer than a pixel of any image."""
-ENERGY = 4.0
-"""The first images hold 1/ENERGY of the sum of all spectral amplitudes."""
+FIRST_ENERGY_DIVISOR = 4.0
+"""The first images hold 1/FIRST_ENERGY_DIVISOR of the sum of all spectral amplitudes."""
 
 Rounding = Literal["real", "floor"]
 
@@ -54,7 +54,7 @@ class Spectrum:
     def scale_of(self, energy: float) -> float:
         """Return the largest scale >= 1 whose window holds at least this sum."""
         low, high = 0.0, 1.0  # of 1 / scale
-        for _ in range(HALVINGS):
+        for _ in range(BISECTION_STEPS):
             middle = (low + high) / 2
             if middle > 0 and self.within(1 / middle) < energy:
                 low = middle
@@ -86,7 +86,7 @@ class ResolutionPlan:
 
 def first_scale(spectrum: Spectrum) -> float:
     """Return the scale at which one picture holds its first share of the amplitudes."""
-    return spectrum.scale_of(spectrum.within(1) / ENERGY)
+    return spectrum.scale_of(spectrum.within(1) / FIRST_ENERGY_DIVISOR)
 
 
 def resolution_plan(first: float, mean: Spectrum, *, full_at: int) -> ResolutionPlan:

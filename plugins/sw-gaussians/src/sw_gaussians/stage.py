@@ -20,7 +20,7 @@ from sw_gaussians.adam_moments import keep_moments
 from sw_gaussians.averaging import average_of_the_end
 from sw_gaussians.control_tasks import control_task
 from sw_gaussians.fast.fused_adam import FusingOptimizer, offer_updates
-from sw_gaussians.late_batches import AFTER_ALL, SumViews
+from sw_gaussians.late_batches import LAST_PRIORITY, SumViews
 from sw_gaussians.learning_rate import UpdateLearningRate
 from sw_gaussians.sparse_adam import SparseSplatOptimizer
 
@@ -56,7 +56,7 @@ class ThreeDGSStage(Stage):
 
     control         what adds and removes Gaussians: `config.density.load(plugins)`; None: adaptive density control
     fuses_updates   on CUDA spherical harmonics are updated in the backward pass, at steps at which nothing else asks
-                    for their gradients; with dense Adam alone. None: from `fused_adam.FUSED_FROM` Gaussians on
+                    for their gradients; with dense Adam alone. None: from `fused_adam.MIN_FUSED_GAUSSIANS` Gaussians on
     """
 
     name = "3dgs"
@@ -174,7 +174,7 @@ class ThreeDGSStage(Stage):
         if self.config.fast.late_views > 1:
             sums = SumViews(views=self.config.fast.late_views, first=self.settled, last=self.iterations - 1)
             steps = range(self.settled, self.iterations + 1)
-            scheduler.register_task(steps, sums, priority=AFTER_ALL, name="sum views")
+            scheduler.register_task(steps, sums, priority=LAST_PRIORITY, name="sum views")
 
     def _register(self, scheduler: Scheduler, tasks: Iterable[DensityTask], *, every: range) -> None:
         for name, when, do in tasks:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 PRIMITIVE, SURFEL = "primitive", "surfel"
 """Header key and value that mark a file of surfels; absent for other Gaussians."""
 
-THICKNESS = 1e-8
+SURFEL_THICKNESS = 1e-8
 """Third scale of a surfel converted to an ellipsoid, world units."""
 
 
@@ -92,7 +92,7 @@ def as_ellipsoids(model: GaussianModel) -> GaussianModel:
     """
     if model.NUM_SCALES != SurfelModel.NUM_SCALES:
         return model
-    thickness = torch.full_like(model.opacity_logits, math.log(THICKNESS))
+    thickness = torch.full_like(model.opacity_logits, math.log(SURFEL_THICKNESS))
     flat = GaussianModel.from_tensors(
         model.means,
         model.sh_dc,

@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 
-WARM_UPS = 3
+WARM_UP_RUNS = 3
 """Runs before a device's first capture, in which libraries set themselves up; as torch's own `make_graphed_callables`.
 Before a later one there is one, which loads what its shapes need."""
 
@@ -72,7 +72,7 @@ class CapturedStep:
         stream.wait_stream(current)
         # In this thread, or the engine's own would launch what this one's stream is to record.
         with torch.cuda.stream(stream), torch.enable_grad(), torch.autograd.set_multithreading_enabled(False):
-            for _ in range(WARM_UPS if current.device_index not in _WARM else 1):
+            for _ in range(WARM_UP_RUNS if current.device_index not in _WARM else 1):
                 results, _ = compute()
                 slopes = tuple(torch.zeros_like(each) for each in results)
                 differentiate(results, inputs, slopes)

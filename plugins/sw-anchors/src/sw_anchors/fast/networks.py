@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 from sw_anchors.native import ANCHORS
 from sw_anchors.neural_gaussians import Networks
 
-MOST_FEATURES, MOST_HIDDEN, MOST_OUTPUTS, BLOCK_BYTES = 51, 51, (16, 80, 32), 164_352
+MAX_FEATURES, MAX_HIDDEN, MAX_OUTPUTS, BLOCK_BYTES = 51, 51, (16, 80, 32), 164_352
 """Size limits of the CUDA kernel, and its shared memory per block: see kernels/cuda/networks.h."""
 
 
@@ -41,9 +41,9 @@ def fits_kernel(positions: Tensor, features: Tensor, parameters: Sequence[Tensor
     if not all(t.is_cuda and t.dtype == torch.float32 for t in (positions, features, *parameters)):
         return False
     hidden, outputs = {len(bias) for bias in parameters[1::4]}, [len(bias) for bias in parameters[3::4]]
-    if len(hidden) > 1 or max(hidden) > MOST_HIDDEN or features.shape[1] > MOST_FEATURES or features.stride(1) != 1:
+    if len(hidden) > 1 or max(hidden) > MAX_HIDDEN or features.shape[1] > MAX_FEATURES or features.stride(1) != 1:
         return False
-    if any(count > most for count, most in zip(outputs, MOST_OUTPUTS, strict=True)):
+    if any(count > most for count, most in zip(outputs, MAX_OUTPUTS, strict=True)):
         return False
     room = torch.cuda.get_device_properties(features.device).shared_memory_per_block_optin
     return room >= BLOCK_BYTES and ANCHORS.has_cuda()

@@ -18,13 +18,13 @@ from sw_anchors.native import ANCHORS
 from sw_anchors.shape import AnchorShape
 from sw_codecs.quantizers.binary import SteMask
 
-MOST_TENSORS = 12
+MAX_TENSORS = 12
 """Largest number of tensors per launch: `kTensors` of kernels/rows.h."""
 
 
 def fit_kernels(*tensors: Tensor) -> bool:
     """Whether there are kernels for these tensors, of 4 bytes a number on CUDA with rows without gaps; loads them."""
-    if not tensors or len(tensors) > MOST_TENSORS:
+    if not tensors or len(tensors) > MAX_TENSORS:
         return False
     if not all(t.is_cuda and t.element_size() == 4 and t.dim() > 0 for t in tensors):
         return False

@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-SMALLEST = 256
+MIN_CAPACITY = 256
 """Smallest capacity."""
 
 
@@ -88,6 +88,6 @@ class ExpectedRows(SeenRows):
 
 def capacity_of(count: int) -> int:
     """Round `count` anchors up to a capacity, four sizes per octave."""
-    size = max(count + 1, SMALLEST)
+    size = max(count + 1, MIN_CAPACITY)
     unit = 1 << (size.bit_length() - 3)
     return -(-size // unit) * unit

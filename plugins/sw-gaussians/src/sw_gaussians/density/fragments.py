@@ -10,7 +10,7 @@ from sw_gaussians.fast import statistics as fast
 
 BUFFER = "fragments"
 """Buffer [N,3] of a model: sum of g, sum of g^2, number of fragments, with g = o dL/do of one pixel of one view."""
-LEAST_CLEAR = 1e-6
+MIN_TRANSPARENCY = 1e-6
 """Floor of 1 - opacity when converting d/d logit to d/d opacity."""
 
 
@@ -66,12 +66,12 @@ def accumulate_fragments(sums: Tensor, gradients: Tensor, logits: Tensor, fragme
     gradients   [N] derivative of the loss by the logits [N] of the opacities
     fragments   [N,2] sum of g^2, and number of fragments (RenderResult.fragment_grad)
     """
-    if not fast.accumulate_fragments(sums, gradients, logits, fragments, least_clear=LEAST_CLEAR):
+    if not fast.accumulate_fragments(sums, gradients, logits, fragments, least_clear=MIN_TRANSPARENCY):
         accumulate_fragments_in_torch(sums, gradients, logits, fragments)
 
 
 def accumulate_fragments_in_torch(sums: Tensor, gradients: Tensor, logits: Tensor, fragments: Tensor) -> None:
     """Plain-torch version of `accumulate_fragments`."""
-    clear = (1 - torch.sigmoid(logits)).clamp_min_(LEAST_CLEAR)
+    clear = (1 - torch.sigmoid(logits)).clamp_min_(MIN_TRANSPARENCY)
     sums[:, 0].addcdiv_(gradients, clear)  # do/dlogit = o (1 - o)
     sums[:, 1:].add_(fragments)

@@ -15,7 +15,7 @@ from sw_gaussians.control_tasks import Collect
 if TYPE_CHECKING:
     from splatwizard_core.api import RenderResult, Scheduler
 
-FUSED_FROM = 200_000
+MIN_FUSED_GAUSSIANS = 200_000
 """Smallest number of Gaussians to fuse: step time is equal at 185,000 and 0.91 times at one million."""
 OFFERED = ("sh_dc", "sh_rest")
 """Parameters that may be fused: no activation between storage and kernel; 48 of a Gaussian's 59 numbers."""
@@ -64,11 +64,11 @@ def offer_updates(
 
     post    tasks of the stage
     before  steps from here on make no update
-    forced  also below `FUSED_FROM` Gaussians
+    forced  also below `MIN_FUSED_GAUSSIANS` Gaussians
     """
     if not isinstance(optimizer, FusingOptimizer) or post is None:
         return
-    if not forced and optimizer.model.num_rows < FUSED_FROM:
+    if not forced and optimizer.model.num_rows < MIN_FUSED_GAUSSIANS:
         return
     due = (entry.task for entry in post.registrations if entry.due(step))
     if step < before and torch.is_grad_enabled() and all(isinstance(task, Collect) for task in due):
