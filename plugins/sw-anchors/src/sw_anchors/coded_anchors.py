@@ -1,7 +1,7 @@
 """Anchor model with a rate: attributes are coded under distributions predicted from anchor positions.
 
-As in HAC (arXiv 2403.14530) and CAT-3DGS (arXiv 2503.00357): 16-bit positions, learned offset masks, three phases of
-quantisation, and the rate of a sample. A method adds its rate model.
+Common parts of HAC (arXiv 2403.14530) and CAT-3DGS (arXiv 2503.00357): 16-bit positions, learned offset masks, three
+phases of quantisation, and the rate of a sample. A method adds its rate model.
 """
 
 from __future__ import annotations

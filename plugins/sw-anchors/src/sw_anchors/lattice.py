@@ -1,9 +1,9 @@
 """16-bit lattice of anchor positions, used in training and in the file.
 
-Position x of an axis with bounds lo, hi has the code v = floor((x - lo) / d), d = (hi - lo) / 65535, and is taken to be
-v d + lo. It is the floor since the published methods train with it. Arithmetic is float64 of stored float32 bounds, one
-operation at a time: codes give the same positions on every machine. Source: HAC (arXiv 2403.14530), without the 1e-6
-that its code adds to d: so the normalised coordinate of a code is v / 65535.
+On an axis with bounds lo, hi and step d = (hi - lo) / 65535, position x has the code v = floor((x - lo) / d) and
+decodes to v d + lo. Floor, not rounding, as the published methods train with it. Arithmetic is float64 on stored
+float32 bounds, one operation at a time, so codes decode to the same positions on every machine. Source: HAC (arXiv
+2403.14530), without the 1e-6 that its code adds to d: so the normalised coordinate of a code is v / 65535.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def bounds_of(positions: Tensor, margin: Margin = "none") -> Tensor:
     """Return lattice bounds [2,3] float32 (low, high) for positions [N,3], N > 0.
 
     margin  "none"; "extent": 10 % of the extent at each end; "origin": a fifth of each end's distance from the origin,
-            as HAC has it, which is none where an end is 0 and much where the scene lies far out
+            as in HAC (no margin if an end is 0, a large one if the scene is far from the origin)
     """
     low, high = positions.detach().amin(dim=0), positions.detach().amax(dim=0)
     if margin == "origin":

@@ -16,10 +16,10 @@ RANDOM_START: Mapping[str, Any] = {
     "random_background_until": 1_500,
     "lr.mlp_opacity_early": 0.1,
 }
-"""Start of scenes in the Blender layout, which as a rule come without points (docs/methods/hac.md).
+"""Initialisation for scenes in the Blender layout, which usually have no points (docs/methods/hac.md).
 
-The authors of HAC draw 10,000 points where the folder holds none of an earlier 3DGS training, and take its 100,000
-where it does; their figures are those of the latter.
+The code of HAC samples 10,000 points, or takes the 100,000 points of an earlier 3DGS training if the folder has them.
+The published results match the latter.
 """
 
 
@@ -94,7 +94,7 @@ class AnchorParams(OptimizationParams):
     """Base of the hyper-parameters of an anchor method."""
 
     voxel_size: float = Field(0.001, description="edge of an anchor's cell, world units; <= 0: from the points")
-    num_offsets: int = Field(10, ge=1, le=64, description="Gaussians an anchor can spawn")
+    num_offsets: int = Field(10, ge=1, le=64, description="Gaussians per anchor")
     feature_dim: int = Field(50, ge=1, le=256, description="numbers in an anchor's feature")
     hidden: int = Field(50, ge=1, le=256, description="width of the networks that decode Gaussians")
     paired_offsets: bool = Field(

@@ -1,7 +1,7 @@
 """Rate models: predicted distributions of anchor attributes, for the training rate and for the file.
 
-One object, built from the same grids and networks, gives the bits of a sample in training (`rate`) and the integer
-distributions of the file (`exact`), so that training minimises the size that is coded.
+One object gives the bits of a sample in training (`rate`) and the integer distributions of the file (`exact`). Both use
+the same grids and networks, so training minimises the coded size.
 """
 
 from __future__ import annotations

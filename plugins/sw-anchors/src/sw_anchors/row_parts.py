@@ -1,7 +1,7 @@
 """Row-wise evaluation in parts of bounded size, so that widths claimed by a file cannot exhaust memory.
 
-A block of symbols has up to 2^20 numbers, so as many rows as its columns are few; the context of a row has thousands of
-numbers where a header says so. What leaves a network is as wide as the block, what goes in is not.
+A block of symbols has at most 2^20 numbers, so a narrow block has many rows. The context per row may have thousands of
+numbers if a header says so, and only the network's outputs are as narrow as the block.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def by_parts(evaluate: Callable[[Tensor], Tensor], rows: Tensor, width: int, num
     """Return `evaluate(rows)` of a row-wise function, computed numbers // width rows at a time.
 
     rows        [n, ...]
-    width       the most numbers a row has on the way through `evaluate`
+    width       largest count of numbers per row inside `evaluate`
     """
     parts = iter(parts_of(rows, width, numbers))
     first = evaluate(next(parts))

@@ -1,7 +1,7 @@
 """File sections of an anchor model's geometry (positions, offset masks) and network weights.
 
-Section `anchors`: six little-endian float32 (bounds: low x y z, high x y z), then the 16-bit codes of the
-positions by the position codec `octree`, which fixes the order of all rows. Section `masks`: one symbol per offset,
+Section `anchors`: six little-endian float32 (bounds: low x y z, high x y z), then the 16-bit position codes, coded by
+`octree`; they fix the order of all rows. Section `masks`: one symbol per offset,
 anchor by anchor, by the entropy model `bernoulli`. Section `networks`: every weight and bias in the order of
 `named_parameters`, float32 or float16.
 """

@@ -16,8 +16,8 @@ class AverageParameters:
 
     The training goes on from the model itself, not from the mean, until the last step. Means are part of the
     optimizer's state: they follow rows that go or are put in another order, and are in checkpoints. Rows that come in
-    between would be averaged with zeros, so `first` belongs after the last densification. What nothing has updated
-    stays as it is.
+    between would be averaged with zeros, so `first` belongs after the last densification. Parameters without
+    any update stay unchanged.
     Raises ValueError if `first` is not a whole number of samples before `last`.
     Source: stochastic weight averaging (arXiv 1803.05407).
     """

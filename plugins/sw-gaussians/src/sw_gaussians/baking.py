@@ -1,8 +1,8 @@
 """Baking: fit explicit Gaussians to a model whose Gaussians depend on the camera, over given cameras.
 
-Viewers and interchange formats need explicit Gaussians; anchors with small networks (Scaffold-GS, HAC) are
-none. Positions do not depend on the camera. Opacity, scale, rotation and colour do: of each Gaussian they are fitted
-over the cameras that see it, the first three as means, the colour as spherical harmonics by least squares.
+Viewers and interchange formats need explicit Gaussians; anchors with small networks (Scaffold-GS, HAC) are not.
+Positions do not depend on the camera. Opacity, scale, rotation and colour do, so they are fitted per Gaussian over the
+cameras that see it: the first three as weighted means, the colour as spherical harmonics by least squares.
 """
 
 from __future__ import annotations

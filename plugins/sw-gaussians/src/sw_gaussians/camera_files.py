@@ -32,11 +32,13 @@ class CameraFile:
 def read_cameras(path: str | Path) -> CameraFile:
     """Read a list of cameras, at least one.
 
-    A list of {"width", "height", "fx", "fy", "position" [3], "rotation" [3][3]} is a cameras.json of 3DGS: pixels, the
-    camera's centre in the world, and the rotation from camera to world in OpenCV axes (x right, y down, z forward);
-    "cx" and "cy" in pixels may stand beside them, else the centre. An object with "camera_path" is nerfstudio's:
-    "render_width", "render_height", "fps", and a list of {"camera_to_world" [16] by rows in OpenGL axes (x right, y up,
-    z backward), "fov" vertical, degrees}; it holds in the frame that nerfstudio gave the scene.
+    cameras.json of 3DGS is a list of {"width", "height", "fx", "fy", "position" [3], "rotation" [3][3]}, in pixels.
+    "position" is the camera centre, "rotation" maps camera to world in OpenCV axes (x right, y down, z forward).
+    "cx" and "cy" in pixels are optional (default: the image centre).
+
+    A nerfstudio path is an object with "render_width", "render_height", "fps" and "camera_path". The latter is a list
+    of {"camera_to_world" [16] by rows in OpenGL axes (x right, y up, z backward), "fov" vertical, degrees}, in the
+    frame that nerfstudio gave the scene.
 
     Raises SceneError with the place of what is wrong.
     """

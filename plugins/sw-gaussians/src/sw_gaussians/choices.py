@@ -1,8 +1,8 @@
 """Exchangeable parts of a method: a codec or a pruner chosen by name, with the settings of its package.
 
 A config asks for one with a block, `codec: CodecChoice` or one of its own that extends `PrunerChoice`, and is itself a
-`Choosing`. Then `--set codec=NAME` and `--set codec.settings.KEY=VALUE` work, for a stranger's codec too: keys, types
-and bounds are those of `Settings`, the pydantic model of the class that is registered under that name.
+`Choosing`. Then `--set codec=NAME` and `--set codec.settings.KEY=VALUE` work, also for third-party codecs. Keys,
+types and bounds come from `Settings`, the pydantic model of the class registered under that name.
 """
 
 from __future__ import annotations

@@ -14,10 +14,9 @@ Action = Callable[..., Mapping[str, int] | None]
 class ControlTask:
     """Calls an action of a density control and records the curves that it reports.
 
-    At the last step of a stage nothing happens: no update follows that could repair a picture. A full run ends long
-    after the last densification and opacity reset; a run that is cut short to a multiple of 100 would lose about 0.8 dB
-    (lego, 7,000 steps), one cut to a multiple of 3,000 almost everything. Published figures of short runs are taken
-    before the densification of their last step, too.
+    Does nothing at the last step of a stage, since no update follows. A full run ends long after the last densification
+    and opacity reset. But a run cut to a multiple of 100 steps would lose about 0.8 dB (lego, 7,000 steps), one cut to
+    a multiple of 3,000 almost everything. Published results of short runs are measured before that densification, too.
     """
 
     def __init__(self, do: Action) -> None:

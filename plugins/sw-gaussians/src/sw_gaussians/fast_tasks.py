@@ -1,6 +1,6 @@
 """Schedule tasks of fast training (budget densification, opacity halving, multi-view pruning).
 
-As those of `tasks`, they change nothing at the last step of a stage: no update follows that could repair it.
+Like `tasks`, they do nothing at the last step of a stage, since no update follows.
 """
 
 from typing import Literal

@@ -9,12 +9,12 @@ class SettleLearningRates:
     """Decays learning rates log-linearly between two steps.
 
     rates   parameter group -> its rate until `first`; groups that the optimizer lacks are left out
-    first   step up to which the rates are whole
-    last    step at which they are `factor` times as high, and from which they stay so
+    first   last step with full rates
+    last    step from which the rates are `factor` times the full ones
     factor  > 0, at most 1; with 1 nothing changes
 
-    Adam's step has the size of its learning rate however small a gradient is, so that with a constant rate a model goes
-    on swinging around what fits all views best. Source: our own; plans of 3DGS lower the rate of the means alone.
+    Adam's step size equals its learning rate however small the gradient is. So with a constant rate the parameters keep
+    oscillating around the optimum. Source: our own; plans of 3DGS lower the rate of the means alone.
     Raises ValueError for a factor outside its range, or last <= first.
     """
 

@@ -24,8 +24,8 @@ Array = npt.NDArray[np.float32]
 MIP_COMMENT = "SplatRenderMode: mip"
 """Comment of files trained with the Mip-Splatting filter."""
 ORIGIN_COMMENT, WORLD_COMMENT = "world_origin", "world_coordinates"
-"""Words of comments with three numbers: where the origin of the coordinates lies in the world of the scene; of the
-second the coordinates are those of the world, and the numbers say about which origin they can be held in float32."""
+"""Keywords of comments with three numbers. First: world position of the coordinate origin. Second: coordinates are
+world coordinates, and the numbers are a suggested local origin for float32."""
 MAX_OFFSET_RATIO = 1e4
 """Distance from 0, in model sizes, beyond which float64 coordinates get a local origin."""
 _ROWS_AT_ONCE = 1 << 13  # 2 MB of rows: they stay in the processor's cache

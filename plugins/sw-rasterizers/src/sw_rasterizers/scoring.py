@@ -47,10 +47,10 @@ def add_scores(g: GaussianInputs, call: Call, opt: RasterOptions, totals: Totals
 
     call    the view as it is drawn without maps and features, which change no score
 
-    Sums are formed per tile in the dtype of the Gaussians and across tiles and views in float64; on the CPU they are
-    bit-equal for any number of threads, on CUDA each (Gaussian, pixel) counts once but the order of additions varies,
-    unless torch is asked for deterministic algorithms: then a Gaussian's sum over the tiles of a view is float32, too.
-    No score is differentiable, and none touches a gradient.
+    Sums per tile are in the dtype of the Gaussians, sums across tiles and views in float64. On the CPU they are
+    bit-equal for any number of threads. On CUDA the order of additions varies, unless torch uses deterministic
+    algorithms; then a Gaussian's sum over the tiles of a view is float32, too. No score is differentiable, and none
+    touches a gradient.
     """
     MODULE.load()
     sh = g.sh

@@ -1,8 +1,8 @@
 """SH colours from a codebook, without gathering coefficients or gradients per Gaussian.
 
 A Gaussian at SH degree 3 has 48 coefficients and one colour of 3 numbers for a view. Gathered, the coefficients, their
-gradient and its copy in the order of the codebook are 3 x 192 bytes a Gaussian. The kernels read them from the codebook
-(csrc/cpu/shared_colors.cpp, csrc/cuda/shared_colors.cu).
+gradient and its copy in the order of the codebook are 3 x 192 bytes per Gaussian. The kernels read them from the
+codebook (csrc/cpu/shared_colors.cpp, csrc/cuda/shared_colors.cu).
 """
 
 from __future__ import annotations

@@ -35,10 +35,10 @@ MAPS = {"accumulated": slice(0, 1), "inverse": slice(1, 2), "normals": slice(2, 
 class SurfelRasterizer:
     """2DGS with gradients of all inputs; float32, on the CPU also float64 for gradient checks.
 
-    Draws what the reference draws for scales [N,2]: with profile "3dgs" the exact support of every surfel, with
-    "dgr-exact" cut at the 16x16 tile squares of the published kernels and with the gradient passing through the clamp
-    of alpha (the gradient of depth through the low-pass branch, which those leave out in part, stays exact).
-    The densification statistic is the derivative with respect to a shift of the surfel on the screen.
+    Renders like the reference for scales [N,2]. Profile "3dgs" has the exact support of every surfel. Profile
+    "dgr-exact" cuts surfels at the 16x16 tile squares of the published kernels, and passes gradients through the clamp
+    of alpha. The depth gradient through the low-pass branch, which those kernels omit in part, stays exact. The
+    densification statistic is the derivative with respect to a shift of the surfel on the screen.
 
     count   also count evaluated and blended pixel-surfel pairs into the statistics; slow, for benchmarks; on
             CUDA also the only way to the seconds of the stages, which wait for the device

@@ -18,9 +18,9 @@ class IndexedRasterizer(StandardRasterizer):
     """Renders Gaussians with indexed SH colours and shapes, and a scale factor per Gaussian.
 
     The projection reads scales and quaternions through the index, forward and backward, and `shared_colors` the SH
-    coefficients: what a Gaussian gets of its own is a colour. Gradients of codebook rows are sums over their users: in
-    a fixed order on the CPU, for any number of threads; on CUDA those of shapes are atomic, unless torch is asked for
-    deterministic algorithms: then shapes are gathered. Source: C3DGS (arXiv 2401.02436).
+    coefficients; only the resulting colour is stored per Gaussian. Gradients of codebook rows are summed in a fixed
+    order on the CPU, for any number of threads. On CUDA those of shapes use atomics, unless torch uses deterministic
+    algorithms; then shapes are gathered. Source: C3DGS (arXiv 2401.02436).
     """
 
     info = RasterizerInfo.declared(plugin.register_rasterizers, "c3dgs")

@@ -24,8 +24,8 @@ _RANGE = re.compile(r"range\(\s*(\d+)\s*(?:,\s*(\d+)\s*)?(?:,\s*(\d+)\s*)?\)")
 def add_tasks(stages: Sequence[Stage], tasks: Iterable[AddedTask], plugins: PluginManager) -> list[Stage]:
     """Return a method's stages with the configured tasks added to their plans, after the stages' own tasks.
 
-    Raises ConfigError for a task, stage or setting that is not there, with the nearest, and for steps or values that
-    make no sense; PluginError for a task that is broken.
+    Raises ConfigError for invalid steps or values, and for an unknown task, stage or setting, with the nearest name.
+    Raises PluginError for a task that is broken.
     """
     for number, each in enumerate(tasks, 1):
         where = f"tasks, {number}. '{each.name}'"

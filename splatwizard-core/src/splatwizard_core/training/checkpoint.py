@@ -1,8 +1,8 @@
 """Checkpoints: a safetensors file of all tensors and a JSON file of everything else, written as a pair. No pickle.
 
-`00-0001000.safetensors` + `00-0001000.json`: stage 0 after step 1000. Both carry the same random pair id; the JSON
-file, renamed into place last, makes the pair valid, names the other one and holds a CRC-32 of itself and of every
-tensor. Where the same step is written again, its tensors get another name: at no moment is there half a pair.
+`00-0001000.safetensors` + `00-0001000.json`: stage 0 after step 1000. Both carry the same random pair id. The JSON file
+is renamed into place last, which makes the pair valid. It names the other file and holds a CRC-32 of itself and of
+every tensor. If a step is written again, its tensors get a new name, so the old pair stays valid until then.
 """
 
 from __future__ import annotations

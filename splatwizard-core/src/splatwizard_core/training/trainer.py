@@ -1,7 +1,7 @@
 """Training loop of one stage, independent of the method: pre tasks, render, loss, post tasks, optimizer.
 
-What published numbers depend on: post tasks run between backward and the optimizer step; a parameter that a task
-has replaced has no gradient and is skipped; the last step makes no update.
+Published numbers depend on three rules. Post tasks run between backward and the optimizer step. A parameter that a task
+has replaced has no gradient and is skipped. The last step makes no update.
 """
 
 from __future__ import annotations

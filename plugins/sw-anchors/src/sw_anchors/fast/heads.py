@@ -1,7 +1,7 @@
 """Anchor networks and Gaussian spawning fused: one CPU kernel each for forward and backward.
 
-Hidden layers of all three networks are one product; of the networks of shapes and colours only the outputs of Gaussians
-that are drawn are computed, which are fewer than half (benchmarks/train_anchors.py).
+Hidden layers of all three networks are one matrix product. The covariance and colour networks compute only the outputs
+of rendered Gaussians, fewer than half (benchmarks/train_anchors.py).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The three anchor networks of a view as one autograd node.
 
-A step of training is bound by how many operators the host has to launch, not by what they compute: the first layers of
-all three are one product, and the gradient is written down (benchmarks/train_anchors.py).
+Operator launches, not arithmetic, limit a training step. So the first layers of all three are one matrix product, and
+the gradient is explicit (benchmarks/train_anchors.py).
 """
 
 from __future__ import annotations

@@ -82,8 +82,8 @@ class _Prepared:
 class FixedDecoder:
     """Decodes one CodedAnchors in training; captures a step when its capacity is first needed.
 
-    All are prepared anew after a change of what decides the operators (plain values of the model and of its rate model)
-    or of a tensor of the model that does not belong to single anchors (a network was replaced). Growth changes neither.
+    All steps are captured again if a plain value of the model or its rate model changes, since it may select operators,
+    or if a tensor without anchor rows is replaced (such as a network weight). Growth changes neither.
 
     captures    how many steps were prepared, since this was made
     """

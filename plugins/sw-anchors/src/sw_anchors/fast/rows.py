@@ -23,7 +23,7 @@ MAX_TENSORS = 12
 
 
 def fit_kernels(*tensors: Tensor) -> bool:
-    """Whether there are kernels for these tensors, of 4 bytes a number on CUDA with rows without gaps; loads them."""
+    """Whether there are kernels for these tensors, on CUDA, 4 bytes per number, contiguous rows; loads them."""
     if not tensors or len(tensors) > MAX_TENSORS:
         return False
     if not all(t.is_cuda and t.element_size() == 4 and t.dim() > 0 for t in tensors):

@@ -74,15 +74,15 @@ class ExpectedRows(SeenRows):
         to.copy_(self._count)
 
     def fit(self) -> bool:
-        """As of SeenRows; waits as `number`."""
+        """Whether all visible rows fit, see SeenRows; waits like `number`."""
         return self.number() < self.capacity
 
     def placed(self) -> Tensor:
-        """As of SeenRows; waits as `number`."""
+        """Visible rows within the capacity, see SeenRows; waits like `number`."""
         return self.loaded[: self.number()]
 
     def known(self) -> Tensor:
-        """As of SeenRows; waits for the device."""
+        """All visible rows, see SeenRows; waits for the device."""
         return self._order[self._seen]
 
 

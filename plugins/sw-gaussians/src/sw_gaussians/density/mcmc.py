@@ -1,8 +1,7 @@
 """Density control of 3DGS-MCMC: relocate dead Gaussians onto live ones, add new ones, add noise to positions.
 
-Every draw comes from a stream that is named after the step, so there is no state to save: a run that resumes at a step
-draws what the uninterrupted one drew there.
-Source: 3D Gaussian Splatting as Markov Chain Monte Carlo (arXiv 2404.09591).
+Random numbers come from a stream per step, so there is no generator state to save: a resumed run draws the same
+numbers. Source: 3D Gaussian Splatting as Markov Chain Monte Carlo (arXiv 2404.09591).
 """
 
 from __future__ import annotations
@@ -166,10 +165,10 @@ def relocate(
 ) -> int:
     """Move every Gaussian with opacity <= `min_opacity` onto a live one; return how many moved.
 
-    The live ones are drawn in proportion to their opacity, and each shares its opacity and scales with those that come
-    (`shared_among`). Adam moments of the sources become zero, the moved ones keep theirs: with a second moment of zero
-    the tiny gradients of the regularisers make steps of several learning rates for as long as no view shows a
-    Gaussian, so that it dies again. If none is dead, or none is alive, nothing happens.
+    Targets are sampled in proportion to opacity; each shares its opacity and scales with its arrivals (`shared_among`).
+    Adam moments of the targets become zero, those of moved Gaussians stay. With a second moment of zero, the tiny
+    gradients of the regularisers would make steps of several learning rates until a view shows the Gaussian, so that
+    it dies again. If none is dead, or none is alive, nothing happens.
     """
     opacities = model.opacities
     is_dead = opacities <= min_opacity

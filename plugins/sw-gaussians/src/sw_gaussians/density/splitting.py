@@ -13,8 +13,8 @@ def split_children(
 ) -> dict[str, Tensor]:
     """Return `count` children per parent [P], tensors [count P, ...]: all first children, then all second, ...
 
-    A child lies at centre + R (scales * z) with z from the model's stream of splits, has the parent's scales divided
-    by `shrink` (None: 0.8 count), and the rest unchanged; those of a surfel, of two scales, stay in its plane.
+    A child's position is centre + R (scales * z), z ~ N(0, I) from the model's stream of splits. Its scales are the
+    parent's divided by `shrink` (None: 0.8 count); all else is copied. Children of a surfel stay in its plane.
     """
     rows = {
         name: parameter.detach()[parents].repeat(count, *[1] * (parameter.dim() - 1))

@@ -83,7 +83,7 @@ class UpdateRates:
 def windows_before(removals: Iterable[int], length: int) -> list[range]:
     """Return per removal (steps, ascending) the range of `length` steps before it, over which gradients are averaged.
 
-    No window reaches behind the removal before. Of removals in successive steps each has the gradients of its own step,
+    No window starts before the previous removal. A removal right after another one uses the gradients of its own step,
     which are collected first.
     """
     steps = list(removals)
