@@ -203,7 +203,7 @@ def test_sums_over_fragments_of_one_launch_are_those_of_many():
         logits[:4] = torch.tensor([-40.0, 17.0, 90.0, float("nan")])
         found = torch.rand(500, 2, generator=generator).cuda()
         assert torch.ops.splatwizard_gaussians.fragment_statistics(
-            gradients, logits, found, ours, fragments.LEAST_CLEAR
+            gradients, logits, found, ours, fragments.MIN_TRANSPARENCY
         )
         fragments.accumulate_fragments_in_torch(theirs, gradients, logits, found)
     torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-6, equal_nan=True)

@@ -23,7 +23,7 @@ def test_parts_are_as_small_as_asked_and_give_the_whole():
 
 def test_a_wide_context_is_never_there_whole(monkeypatch):
     """4,096 rows of a context of 2,048 numbers, which a file of a kilobyte may claim: 64 MiB in int64."""
-    monkeypatch.setattr(attribute_sections, "EXACT_NUMBERS", 1 << 16)
+    monkeypatch.setattr(attribute_sections, "MAX_EXACT_NUMBERS", 1 << 16)
     shape, width, seen = AnchorShape(1, 1), 2048, []
     network = nn.Sequential(nn.Linear(width, 1), nn.ReLU(), nn.Linear(1, sum(shape.outputs)))
     nn.init.normal_(network[2].bias, generator=torch.Generator().manual_seed(0))

@@ -20,8 +20,8 @@ def test_wide_contexts_are_computed_a_few_anchors_at_a_time(mode, method, monkey
     with torch.no_grad():
         whole = CatRateModel.of_file(context).predictor(mode).first(places)
         seen, limit = [], 30 * context.triplane.width
-        monkeypatch.setattr("sw_anchors.attribute_sections.EXACT_NUMBERS", limit)
-        monkeypatch.setattr("sw_cat_3dgs.rate_model.FLOAT_NUMBERS", limit)
+        monkeypatch.setattr("sw_anchors.attribute_sections.MAX_EXACT_NUMBERS", limit)
+        monkeypatch.setattr("sw_cat_3dgs.rate_model.MAX_FLOAT_NUMBERS", limit)
         context.network.register_forward_pre_hook(lambda _, inputs: seen.append(len(inputs[0])))
         predictor = CatRateModel.of_file(context).predictor(mode)
         if mode == "exact":

@@ -160,7 +160,7 @@ def test_many_frames_of_few_pictures_and_endless_names_are_one_short_line(tmp_pa
     looked: list[str] = []
     of = picture_names._Files.of
     monkeypatch.setattr(picture_names._Files, "of", lambda self, name: looked.append(name) or of(self, name))
-    monkeypatch.setattr("sw_datasets.gate.read_header", None)
+    monkeypatch.setattr("sw_datasets.image_checks.read_header", None)
     (tmp_path / "images").mkdir()
     Image.new("RGB", (32, 24)).save(tmp_path / "images" / "0.png")
     matrix = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]

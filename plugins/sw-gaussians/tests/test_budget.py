@@ -271,7 +271,7 @@ def test_opacity_gradients_are_added_view_by_view():
     model.opacity_logits.grad = torch.tensor([0.25, 1e-6, 0.0])
     for _ in range(2):
         fragments.collect_opacity_gradients(model, result)
-    # g = dL/dlogit / (1 - o), and at least LEAST_CLEAR is divided by
+    # g = dL/dlogit / (1 - o), and at least MIN_TRANSPARENCY is divided by
     torch.testing.assert_close(model.fragments, torch.tensor([[1.0, 8.0, 4.0], [2.0, 2.0, 2.0], [0.0, 0.0, 0.0]]))
 
 

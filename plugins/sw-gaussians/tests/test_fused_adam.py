@@ -94,7 +94,7 @@ def test_it_is_offered_where_no_task_but_the_statistics_follows(monkeypatch):
     for step in range(1, 41):
         stage.raster_options(step, background)
     assert offered == []  # or there are many Gaussians
-    monkeypatch.setattr("sw_gaussians.fast.fused_adam.FUSED_FROM", stage._optimizer.model.num_rows)
+    monkeypatch.setattr("sw_gaussians.fast.fused_adam.MIN_FUSED_GAUSSIANS", stage._optimizer.model.num_rows)
     stage.raster_options(step := 2, background)
     assert offered == [2]
     offered.clear()

@@ -77,7 +77,7 @@ def test_values_are_within_half_a_step_of_the_models():
 def test_how_anchors_are_batched_is_no_matter(monkeypatch):
     """Blocks of rows are part of the format; what is computed at once is not."""
     data = encoded(make(n=100))
-    monkeypatch.setattr("sw_anchors.attribute_sections.EXACT_NUMBERS", 500)
+    monkeypatch.setattr("sw_anchors.attribute_sections.MAX_EXACT_NUMBERS", 500)
     monkeypatch.setattr("sw_codecs.entropy.conditional_mixture.AT_ONCE", 100)
     assert encoded(make(n=100)) == data
     threads = torch.get_num_threads()
@@ -88,7 +88,7 @@ def test_how_anchors_are_batched_is_no_matter(monkeypatch):
         torch.set_num_threads(threads)
 
 
-@pytest.mark.parametrize(("mode", "limit"), [("exact", "EXACT_NUMBERS"), ("float", "FLOAT_NUMBERS")])
+@pytest.mark.parametrize(("mode", "limit"), [("exact", "MAX_EXACT_NUMBERS"), ("float", "MAX_FLOAT_NUMBERS")])
 def test_channel_networks_are_evaluated_a_few_rows_at_a_time(mode, limit, monkeypatch):
     """A hidden layer of 512 for every anchor of a block would take gigabytes, whatever the size of the file."""
     model, seen = make(n=100), []

@@ -410,9 +410,9 @@ def test_a_wide_grid_is_looked_up_a_few_anchors_at_a_time(mode, monkeypatch):
     grid = Lookups(model.grid)
     limit = 20 * grid.corners
     for where, name in (
-        ("sw_anchors.attribute_sections", "EXACT_NUMBERS"),
-        ("sw_anchors.fast.exact_lattice", "EXACT_NUMBERS"),
-        ("sw_hac.rate_model", "FLOAT_NUMBERS"),
+        ("sw_anchors.attribute_sections", "MAX_EXACT_NUMBERS"),
+        ("sw_anchors.fast.exact_lattice", "MAX_EXACT_NUMBERS"),
+        ("sw_hac.rate_model", "MAX_FLOAT_NUMBERS"),
     ):
         monkeypatch.setattr(f"{where}.{name}", limit)
     found = dataclasses.replace(model.rate_model, grid=grid).predictor(mode)(model.codes())

@@ -172,7 +172,7 @@ def test_pruning_goes_on_with_the_moments_of_the_3dgs_training(asked, restored):
     """As in the authors' code, which restores the optimizer from the checkpoint."""
     import copy
 
-    from sw_gaussians.moments import keep_moments
+    from sw_gaussians.adam_moments import keep_moments
 
     config = LightGaussianConfig()
     config = config.model_copy(update={"prune": config.prune.model_copy(update={"optimizer": asked})})

@@ -5,7 +5,7 @@ docs/plugins.md describes each. Everything else in `splatwizard_core` may change
 
 from __future__ import annotations
 
-from splatwizard_native import lend
+from splatwizard_native import lazy_exports
 
 MODULES = {
     "plugins.hookspecs": "hookimpl",
@@ -21,7 +21,7 @@ MODULES = {
     "scene.dataset": "SceneOptions Dataset",
     "gaussians.splat_model": "SplatModel",
     "gaussians.model": "GaussianModel",
-    "gaussians.sound": "LeftOut leave_out_senseless",
+    "gaussians.invalid_rows": "LeftOut leave_out_senseless",
     "gaussians.placement": "origin_of placed_in world_shift",
     "gaussians.inputs": "GaussianInputs SH SH_C0 rgb_to_dc",
     "rendering.rasterizer": "Rasterizer RasterOptions RenderResult RasterStats AccumOutput GradBuffer ScoreSpec",
@@ -53,4 +53,4 @@ MODULES = {
 BASE = {"errors": "ForeseenError", "files": "replacing", "progress": "track"}
 """The same of splatwizard-native."""
 
-__all__, __getattr__ = lend(__name__, MODULES, BASE)
+__all__, __getattr__ = lazy_exports(__name__, MODULES, BASE)

@@ -28,12 +28,12 @@ from splatwizard_core.gaussians.inputs import SH as SH
 from splatwizard_core.gaussians.inputs import SH_C0 as SH_C0
 from splatwizard_core.gaussians.inputs import GaussianInputs as GaussianInputs
 from splatwizard_core.gaussians.inputs import rgb_to_dc as rgb_to_dc
+from splatwizard_core.gaussians.invalid_rows import LeftOut as LeftOut
+from splatwizard_core.gaussians.invalid_rows import leave_out_senseless as leave_out_senseless
 from splatwizard_core.gaussians.model import GaussianModel as GaussianModel
 from splatwizard_core.gaussians.placement import origin_of as origin_of
 from splatwizard_core.gaussians.placement import placed_in as placed_in
 from splatwizard_core.gaussians.placement import world_shift as world_shift
-from splatwizard_core.gaussians.sound import LeftOut as LeftOut
-from splatwizard_core.gaussians.sound import leave_out_senseless as leave_out_senseless
 from splatwizard_core.gaussians.splat_model import SplatModel as SplatModel
 from splatwizard_core.method import Method as Method
 from splatwizard_core.method import create_method as create_method

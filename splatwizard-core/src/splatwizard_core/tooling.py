@@ -5,7 +5,7 @@ Documented in docs/plugins.md; unlike `api` it is not promised to stay as it is.
 
 from __future__ import annotations
 
-from splatwizard_native import lend
+from splatwizard_native import lazy_exports
 
 MODULES = {
     "plugins.manager": "PluginManager load_plugins",
@@ -52,4 +52,4 @@ MODULES = {
 BASE = {"files": "bytes_with_named file_sha256 new_folder write_atomic write_json", "progress": "Bar"}
 """The same of splatwizard-native."""
 
-__all__, __getattr__ = lend(__name__, MODULES, BASE)
+__all__, __getattr__ = lazy_exports(__name__, MODULES, BASE)

@@ -15,7 +15,7 @@ from splatwizard_native.errors import ForeseenError as ForeseenError
 from splatwizard_native.errors import NativeBuildError as NativeBuildError
 from splatwizard_native.errors import out_of_memory as out_of_memory
 from splatwizard_native.errors import shortened as shortened
-from splatwizard_native.lending import lend as lend
+from splatwizard_native.lazy_imports import lazy_exports as lazy_exports
 
 if TYPE_CHECKING:
     from splatwizard_native.core_time import CoreTime as CoreTime
@@ -83,7 +83,7 @@ MODULES = {
         "TEMPORARY bytes_with_named file_sha256 naming_full_disk new_folder remove_folder replacing scratch_folder "
         "sweep write_atomic write_json"
     ),
-    "lending": "lend",
+    "lazy_imports": "lazy_exports",
     "fused.activations": "activated",
     "fused.adam": "AdamUpdate adam_steps",
     "fused.in_backward": "end_offer offer_update offered_update",
@@ -102,4 +102,4 @@ MODULES = {
 }
 """Module -> the names that are offered here."""
 
-__all__, __getattr__ = lend(__name__, MODULES)
+__all__, __getattr__ = lazy_exports(__name__, MODULES)

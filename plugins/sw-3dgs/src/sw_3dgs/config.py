@@ -6,17 +6,17 @@ from typing import Any, ClassVar
 from pydantic import Field
 from sw_gaussians.choices import CodecChoice, Moved
 from sw_gaussians.config import GaussianTraining
-from sw_gaussians.fast.fused_adam import FUSED_FROM
+from sw_gaussians.fast.fused_adam import MIN_FUSED_GAUSSIANS
 
 from splatwizard_core.api import InputFile
 from sw_codecs.models.settings import QuantizedSettings
 
 MODES = {"exact": "gaussians-exact", "quantized": "gaussians-quantized"}
-"""Word in the header of a file, and of `codec.mode` in configs of 0.1 -> codec."""
+"""Header value `mode` of a file (and `codec.mode` of 0.1 configs) -> codec."""
 
 
 class ThreeDGSConfig(GaussianTraining):
-    """Everything that can be set for 3DGS."""
+    """Configuration of 3DGS."""
 
     OLDER: ClassVar[Mapping[str, Moved]] = {
         f"codec.{name}": Moved((f"codec.settings.{name}",), field.default, MODES["quantized"])
@@ -31,7 +31,7 @@ class ThreeDGSConfig(GaussianTraining):
     fused_updates: bool | None = Field(
         None,
         description="on CUDA, update spherical harmonics in the backward pass, equal but for rounding; None: from "
-        f"{FUSED_FROM:,} Gaussians on, where it is faster",
+        f"{MIN_FUSED_GAUSSIANS:,} Gaussians on, where it is faster",
     )
     codec: CodecChoice = Field(CodecChoice(name="gaussians-exact"), description="what writes the file")
 

@@ -1,4 +1,4 @@
-"""3D Gaussian Splatting: the method that the others start from, and the baseline that they are compared with."""
+"""3D Gaussian Splatting: the baseline method, and the start of most others."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class ThreeDGS(GaussianMethod):
     )
 
     def create_model(self, scene: Scene, generator: torch.Generator) -> SplatModel:
-        """Gaussians of the .ply that `init` names, else one for each start point of the scene."""
+        """Return the Gaussians of the .ply that `init` names, else one per start point of the scene."""
         config: ThreeDGSConfig = self.config
         if config.init:
             model = placed_in(self.plugins.read_gaussians(Path(config.init)), scene, str(config.init))
@@ -52,7 +52,7 @@ class ThreeDGS(GaussianMethod):
         return [ThreeDGSStage(config, config.density.load(self.plugins), fuses_updates=config.fused_updates)]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
-        """Write the model with the chosen codec, which the header calls `mode`, or `codec` if it is not one of two."""
+        """Write the model with the chosen codec; the header names it in `mode`, other codecs in `codec`."""
         super().encode(model, writer)
         mode = next((mode for mode, name in MODES.items() if name == writer.static[HEADER_KEY]), None)
         if mode is not None:

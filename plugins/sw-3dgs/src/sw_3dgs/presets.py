@@ -1,4 +1,4 @@
-"""Named configurations, and the rate points of the file."""
+"""Presets (named configurations) and rate points of 3DGS."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -26,9 +26,9 @@ FAST: Mapping[str, Any] = {
 }
 """Steps, growth and learning rates of fast training; `iterations` scales all of it.
 
-Source: LiteGS (arXiv 2503.01199), with new Gaussians bounded by twice what plain density control would copy: on a room
-(400x266, seed 0) 32.14 dB with 766,000 Gaussians, without the bound 32.18 dB with 1,000,000. What each part brings: the
-README of sw-3dgs.
+Source: LiteGS (arXiv 2503.01199), with at most twice as many new Gaussians as plain density control would copy. On a
+room (400x266, seed 0): 32.14 dB with 766,000 Gaussians, without the bound 32.18 dB with 1,000,000. The README of
+sw-3dgs lists the effect of each part.
 """
 
 FAST_CPU: Mapping[str, Any] = {
@@ -47,10 +47,10 @@ FAST_CPU: Mapping[str, Any] = {
     "density.settings.opacity": "reset",
     "pictures.schedule": "dash",
 }
-"""`fast` for two cores: few steps, as large as those of `quick`, and no more Gaussians than such a run can fit.
+"""`fast` for two cores: few steps, the learning rates of `quick`, and few Gaussians.
 
-Two thirds of a step on a CPU are blending, which grows with pixels and Gaussians; hence small pictures at first
-(DashGaussian, arXiv 2503.18402). What each part brings: docs/methods/3dgs.md.
+Two thirds of a step on a CPU are blending, which grows with pixels and Gaussians; hence small images at first
+(DashGaussian, arXiv 2503.18402). docs/methods/3dgs.md lists the effect of each part.
 """
 
 PRESETS: Mapping[str, Mapping[str, Any]] = {

@@ -1,1 +1,1 @@
-"""Anchors that spawn Gaussians per view: model, training stage and file sections of Splatwizard's anchor methods."""
+"""Anchor models (Scaffold-GS family): model, training stage and file sections shared by anchor methods."""

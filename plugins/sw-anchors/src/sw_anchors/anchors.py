@@ -1,6 +1,6 @@
-"""Anchors that spawn k Gaussians per view through small networks: the model of Scaffold-GS and what builds on it.
+"""Anchor model of Scaffold-GS: anchors that spawn k Gaussians per view through small networks.
 
-`AnchorSplats` is the decoding alone, `AnchorModel` what is trained; see also `coded_anchors` and `decoded_anchors`.
+`AnchorSplats` only decodes, `AnchorModel` is trained; see also `coded_anchors` and `decoded_anchors`.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ if TYPE_CHECKING:
     from splatwizard_core.api import Rasterizer
 
 MIN_SQUARED_DISTANCE = 1e-7
-"""Floor of the squared neighbour distance that sets an anchor's first scales, world units squared."""
+"""Floor of the squared neighbour distance that initialises anchor scales, world units squared."""
 
 
 @dataclass(frozen=True)
 class AnchorAttributes:
-    """Attributes of V anchors as they are decoded: raw, noisy or dequantised, as the model decides.
+    """Attributes of V anchors as inputs of the networks: raw, noisy or dequantised, by training phase.
 
     positions   [V,3] world units
     features    [V,F]
@@ -73,7 +73,7 @@ class AnchorSelection:
 
 
 class AnchorSplats(SplatModel):
-    """Base of all anchor models: choice of the visible anchors, decoding into Gaussians. A subclass stores attributes.
+    """Base of all anchor models: selects visible anchors and decodes Gaussians. Subclasses store attributes.
 
     mlp_opacity, mlp_cov, mlp_color     from (feature, direction, distance) to k values, 7 k, 3 k; one hidden layer
 
@@ -96,10 +96,10 @@ class AnchorSplats(SplatModel):
 
     @torch.no_grad()
     def pair_offsets(self) -> None:
-        """Let the opacity network say of offset j + k/2 the opposite of what it says of j, the last of an odd k aside.
+        """Initialise the opacity network so that offset j + k/2 gets minus the output of j (odd k: except the last).
 
-        For a new model: its anchors have equal features, so that an offset is visible of all of them or of none. With
-        random weights a seed decides of how many of ten: of 1.6 or of 8.7 on average over views.
+        New anchors have equal features, so an offset is visible for all anchors or for none. With random weights the
+        number of visible offsets (of ten) depends on the seed: 1.6 to 8.7 on average over views.
         """
         _, last = linear_layers(self.mlp_opacity)
         half = self.num_offsets // 2
@@ -108,24 +108,24 @@ class AnchorSplats(SplatModel):
 
     @property
     def num_offsets(self) -> int:
-        """k, Gaussians an anchor can spawn."""
+        """k, the number of Gaussians per anchor."""
         raise NotImplementedError
 
     def positions(self) -> Tensor:
-        """[N,3] positions of the anchors, in rendering and growth alike."""
+        """Positions [N,3] of the anchors, world units."""
         raise NotImplementedError
 
     def reach(self) -> Tensor:
-        """[N,3] radii of the ball about an anchor that its offsets lie in, world units; for the visibility test."""
+        """Extent [N,3] of an anchor's offsets per axis, world units; for the visibility test."""
         raise NotImplementedError
 
     def attributes(self, rows: Tensor) -> AnchorAttributes:
-        """Attributes of the anchors `rows` [V] as the networks see them; differentiable."""
+        """Return the attributes of the anchors `rows` [V] as network inputs; differentiable."""
         raise NotImplementedError
 
     @torch.no_grad()
     def balls(self) -> GaussianInputs:
-        """An opaque ball for every anchor, for the rasterizer's visibility test."""
+        """Return an opaque ellipsoid per anchor, for the rasterizer's visibility test."""
         positions = self.positions()
         key = (len(positions), positions.dtype, positions.device)
         if self._opaque is None or self._opaque[0] != key:
@@ -137,25 +137,25 @@ class AnchorSplats(SplatModel):
 
     @torch.no_grad()
     def visible_anchors(self, camera: Camera, rasterizer: Rasterizer) -> Tensor:
-        """[V] int64: anchors whose ball of offset scales reaches the picture."""
+        """Return the anchors [V] int64 whose ellipsoid of offset scales reaches the image."""
         return torch.nonzero(rasterizer.visible_filter(self.balls(), camera) > 0).squeeze(1)
 
     def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
-        """The Gaussians of the visible anchors; `extras["anchors"]` is the AnchorSelection."""
+        """Return the Gaussians of the visible anchors; `extras["anchors"]` is the AnchorSelection."""
         return self.decode(camera, self.visible_anchors(camera, rasterizer))
 
     @property
     def num_gaussian_ids(self) -> int:
-        """Number of Gaussians that there can be: N k."""
+        """Largest number of Gaussians: N k."""
         return self.num_rows * self.num_offsets
 
     def gaussian_ids(self, inputs: GaussianInputs) -> Tensor:
-        """[M] int64: of `gaussians(...)`, index into the N k offsets of the model; what baking asks for."""
+        """Return, per Gaussian of `gaussians(...)`, its index [M] int64 into the N k offsets; for baking."""
         selection: AnchorSelection = inputs.extras["anchors"]
         return selection.offset_index()
 
     def decode(self, camera: Camera, rows: Tensor) -> GaussianInputs:
-        """The Gaussians of the anchors `rows` [V] as `camera` sees them; those of opacity <= 0 are left out."""
+        """Return the Gaussians of the anchors `rows` [V] as `camera` sees them, without those of opacity <= 0."""
         a = self.attributes(rows)
         given = (camera.center.to(a.positions), a.positions, a.features, a.offsets, a.scales, a.masks)
         decode = fast_spawn.spawn if fast_spawn.fits(*given[1:]) else spawn
@@ -164,7 +164,7 @@ class AnchorSplats(SplatModel):
     def drawn(
         self, rows: Tensor, found: NeuralGaussians, masks: Tensor | None, extras: dict[str, Any]
     ) -> GaussianInputs:
-        """The Gaussians that were spawned by the anchors `rows` [V], with their `masks` [V or more, k], as inputs."""
+        """Return spawned Gaussians of the anchors `rows` [V], with `masks` [V or more, k], as rasterizer inputs."""
         return GaussianInputs(
             means=found.means,
             opacities=found.opacities,
@@ -176,7 +176,7 @@ class AnchorSplats(SplatModel):
 
 
 class AnchorModel(AnchorSplats):
-    """N anchors with k offsets each: the model of Scaffold-GS, to be used as it is or subclassed.
+    """The Scaffold-GS model: N anchors with k offsets each, usable as it is or subclassed.
 
     anchors         [N,3] world units, on a lattice of `voxel_size` when made from points
     features        [N,F]
@@ -255,7 +255,7 @@ class AnchorModel(AnchorSplats):
         generator: torch.Generator,
         **kwargs: Any,
     ) -> AnchorModel:
-        """Make one anchor for every cell of size `voxel_size` that holds a point.
+        """Make one anchor per voxel of size `voxel_size` that holds a point.
 
         voxel_size  world units; <= 0: the median over points of the mean *squared* distance to three neighbours
                     (as published: the square is kept)
@@ -290,11 +290,11 @@ class AnchorModel(AnchorSplats):
 
     @property
     def shape(self) -> AnchorShape:
-        """Features and offsets of an anchor."""
+        """Numbers of features and offsets per anchor."""
         return AnchorShape(self.features.shape[1], self.num_offsets)
 
     def counts(self) -> dict[str, int]:
-        """Numbers of anchors, and of Gaussians that they could spawn."""
+        """Number of anchors, and of Gaussians that they could spawn."""
         return {"num_anchors": self.num_rows, "num_gaussians": self.num_rows * self.num_offsets}
 
     def positions(self) -> Tensor:
@@ -309,11 +309,11 @@ class AnchorModel(AnchorSplats):
         )
 
     def holds(self, positions: Tensor) -> Tensor | None:
-        """[M] bool: whether there may be new anchors at `positions` [M,3], M > 0; None: anywhere."""
+        """Return [M] bool: whether new anchors may be placed at `positions` [M,3], M > 0; None: anywhere."""
         return None
 
     def rows_at(self, positions: Tensor, features: Tensor, size: float) -> dict[str, Tensor]:
-        """Parameters of new anchors at `positions` [M,3] with `features` [M,F] in cells of `size` world units."""
+        """Return parameters of new anchors at `positions` [M,3] with `features` [M,F], voxels of `size` world units."""
         m = len(positions)
         return {
             "anchors": positions,
@@ -323,7 +323,7 @@ class AnchorModel(AnchorSplats):
         }
 
     def state_dict_extra(self) -> dict[str, Any]:
-        """Voxel size, which may come from the points."""
+        """Return the voxel size, which may be computed from the points."""
         return {"voxel_size": self.voxel_size}
 
     def load_state_dict_extra(self, extra: dict[str, Any]) -> None:
@@ -332,7 +332,7 @@ class AnchorModel(AnchorSplats):
 
 
 def linear_layers(network: nn.Sequential) -> tuple[nn.Linear, nn.Linear]:
-    """Both layers of a network Linear, ReLU, Linear."""
+    """Return both linear layers of a network Linear, ReLU, Linear."""
     first, _, last = network
     assert isinstance(first, nn.Linear)
     assert isinstance(last, nn.Linear)

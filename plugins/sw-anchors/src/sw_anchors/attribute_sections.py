@@ -1,8 +1,8 @@
-"""Sections of an anchor file that hold attributes: integers, block by block of anchors, as a rate model predicts them.
+"""File sections of anchor attributes: quantised integers, coded in blocks under the rate model's distributions.
 
-A method writes down once how it walks over the rows, predicting each block of integers from what is known by then. The
-walk hands them to an `AttributeEncoder`, which rounds the values of a model and codes them, or to an
-`AttributeDecoder`, which reads them from the file: both answer with the integers, so both sides know the same.
+A method writes one loop over the blocks, which predicts each block from those before it. The loop passes predictions to
+an `AttributeEncoder`, which rounds and codes a model's values, or to an `AttributeDecoder`, which reads the file. Both
+return the integers, so encoder and decoder make the same predictions.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from splatwizard_core.api import BitstreamError
 from sw_anchors.fast import exact_lattice
-from sw_anchors.row_parts import EXACT_NUMBERS, parts_of
+from sw_anchors.row_parts import MAX_EXACT_NUMBERS, parts_of
 from sw_anchors.shape import GROUPS, AnchorShape
 from sw_codecs.context.integer_mlp import FRACTION, IntegerMlp
 from sw_codecs.entropy.exact_tables import step_multipliers
@@ -35,7 +35,7 @@ Coders = Mapping[type, Any]
 
 
 class Block(NamedTuple):
-    """Numbers of a section that are coded at once: some rows and columns of a group."""
+    """Rows and columns of an attribute group that are coded in one call."""
 
     section: str
     group: str
@@ -44,7 +44,7 @@ class Block(NamedTuple):
 
 
 class AttributeCoder:
-    """One side of the coding of all attributes.
+    """Common interface of AttributeEncoder and AttributeDecoder.
 
     rows        the blocks of rows that a walk goes over, in order
     """
@@ -52,7 +52,7 @@ class AttributeCoder:
     def __init__(
         self, count: int, shape: AnchorShape, mode: str, plugins: PluginManager, further: Coders | None = None
     ) -> None:
-        """Code `count` anchors, in mode "exact" or "float" of the entropy model `conditional-gaussian`.
+        """Set up for `count` anchors; mode "exact" or "float" of the entropy model `conditional-gaussian`.
 
         further     entropy models for other contexts than its own
         """
@@ -61,7 +61,7 @@ class AttributeCoder:
         self.rows = self.coder.blocks(count, max(shape.widths))
 
     def code(self, block: Block, context: Any, step: Tensor, present: Tensor | None = None) -> Tensor:
-        """Code one block and return its integers [n,C] int64, 0 where they are not in the file.
+        """Code one block; return its integers [n,C] int64, 0 where they are not in the file.
 
         context     distributions of its numbers in the units of the mode: RowContext, RowLattice, or a `further` one
         step        [n,1] float64, quantiser steps in units of the values
@@ -97,13 +97,13 @@ class AttributeEncoder(AttributeCoder):
         return symbols
 
     def write(self, writer: ContainerWriter) -> None:
-        """Add all sections, after the walk."""
+        """Add all sections to the file, after the last block."""
         for name, blocks in self._coded.items():
             writer.add(name, self.coder.join(blocks))
 
 
 class AttributeDecoder(AttributeCoder):
-    """Reads what an AttributeEncoder wrote into a DecodedAnchors; errors name the section."""
+    """Reads an AttributeEncoder's sections into a DecodedAnchors; errors name the section."""
 
     def __init__(
         self,
@@ -164,7 +164,7 @@ class ExactNetwork:
         step_offset: int = 0,
         further: int = 0,
     ) -> None:
-        """Take the weights as they are in the file.
+        """Convert weights, already rounded as in the file, to integers.
 
         step_offset added to round(4096 (1 + tanh t)) of a step logit t
         further     outputs that follow those of the shape, in units of 1
@@ -180,11 +180,11 @@ class ExactNetwork:
     def on_lattice(
         self, places: Tensor, features: Callable[[Tensor], Tensor], width: int
     ) -> Mapping[str, RowContext | RowLattice]:
-        """Return the distributions of a call, on the coder's lattice of tables already where there is a kernel."""
+        """Return distributions as a call does, in coder (lattice) form directly if there is a kernel."""
         return exact_lattice.on_lattice(self, places, features, width) or self(places, features, width)
 
     def __call__(self, places: Tensor, features: Callable[[Tensor], Tensor], width: int) -> dict[str, RowContext]:
-        """Predict distributions by group for anchors at `places` [n, ...].
+        """Return distributions per group for anchors at `places` [n, ...].
 
         features    places of some rows -> int64 [rows, inputs] with 12 fractional bits; each row on its own
         width       the most numbers that a row has while they are looked up
@@ -192,16 +192,16 @@ class ExactNetwork:
         return self.read(self.outputs(places, features, width))
 
     def outputs(self, places: Tensor, features: Callable[[Tensor], Tensor], width: int) -> Tensor:
-        """Return outputs of the network, int64 [n, sum(shape.outputs) + further]; arguments as of a call."""
+        """Return network outputs, int64 [n, sum(shape.outputs) + further]; arguments as in a call."""
         outputs = torch.empty(len(places), self.network.outputs, dtype=torch.int64)
         start = 0
-        for part in parts_of(places, width, EXACT_NUMBERS):
+        for part in parts_of(places, width, MAX_EXACT_NUMBERS):
             self.network(features(part), out=outputs[start : start + len(part)])
             start += len(part)
         return outputs
 
     def read(self, outputs: Tensor) -> dict[str, RowContext]:
-        """Read outputs [n, sum(shape.outputs)] as distributions by group."""
+        """Convert outputs [n, sum(shape.outputs)] to distributions per group."""
         parts = torch.split(outputs, self.shape.outputs, dim=1)
         multipliers = torch.from_numpy(step_multipliers(parts[6].numpy()) + self.step_offset)
         return {
@@ -210,6 +210,6 @@ class ExactNetwork:
         }
 
     def steps(self, group: str, context: RowContext | RowLattice) -> Tensor:
-        """Return the quantiser steps [n,1] float64 of a group, in units of the values."""
+        """Return quantiser steps [n,1] float64 of a group, in units of the values."""
         multipliers = torch.as_tensor(context.step)
         return multipliers.to(torch.float64) * (self._base_steps[GROUPS.index(group)] / (1 << FRACTION))

@@ -1,7 +1,7 @@
-"""Anchors whose attributes are coded under distributions predicted from their positions: the model with a rate.
+"""Anchor model with a rate: attributes are coded under distributions predicted from anchor positions.
 
-As in HAC (arXiv 2403.14530) and CAT-3DGS (arXiv 2503.00357): 16-bit positions, learned offset masks, three phases of
-quantisation, and the rate of a sample. A method adds its rate model.
+Common parts of HAC (arXiv 2403.14530) and CAT-3DGS (arXiv 2503.00357): 16-bit positions, learned offset masks, three
+phases of quantisation, and the rate of a sample. A method adds its rate model.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from torch import Tensor, nn
 from sw_anchors.anchors import AnchorAttributes, AnchorModel
 from sw_anchors.fast import noisy_values as fast_values
 from sw_anchors.fast import replay
-from sw_anchors.forecasts import PredictedRate
 from sw_anchors.lattice import Margin, bounds_of, coded_positions, position_codes
 from sw_anchors.noisy_values import ENTROPY as ENTROPY
 from sw_anchors.noisy_values import FULL as FULL
 from sw_anchors.noisy_values import MASK_THRESHOLD, Noise, NoisyValues, draws, noisy_values
 from sw_anchors.noisy_values import QUANTIZED as QUANTIZED
+from sw_anchors.older_coded_anchors import PredictedRate
 from sw_anchors.rate_model import AnchorRate, Context, Floors, RateModel, Triple, triple
 from sw_codecs.quantizers.binary import SteMask
 from sw_codecs.quantizers.rounding import SteRound
@@ -45,7 +45,7 @@ class CodedAnchors(AnchorModel):
     ROWS = (*AnchorModel.ROWS, "mask_logits")
 
     RATE_OF: ClassVar[Literal["visible", "all"]] = "visible"
-    """The anchors whose sample the rate is of: those that a view sees, or all, under noise of their own."""
+    """Anchors that the rate samples from: the visible ones, or all (with separate noise)."""
 
     mask_logits: nn.Parameter
     bounds: Tensor
@@ -65,7 +65,7 @@ class CodedAnchors(AnchorModel):
         scale_floor: float = 0.0,
         **kwargs: Any,
     ) -> None:
-        """As AnchorModel, whose other arguments are `kwargs`.
+        """Initialise like AnchorModel, which gets `kwargs`.
 
         margin          of the bounds, see `lattice.bounds_of`
         noise_factor    multiplies the base steps in the phase QUANTIZED
@@ -89,18 +89,18 @@ class CodedAnchors(AnchorModel):
     # Positions
 
     def update_bounds(self, margin: Margin | None = None) -> None:
-        """Fit the lattice to the anchors of now; None: the margin that the model was made with."""
+        """Fit the lattice to the current anchors; margin None: the one given at construction."""
         self.bounds = bounds_of(self.anchors, self.margin if margin is None else margin)
 
     def codes(self) -> Tensor:
-        """[N,3] int64: positions on the lattice."""
+        """Return lattice codes [N,3] int64 of the positions."""
         return self._on_lattice()[0]
 
     def positions(self) -> Tensor:
         return self._on_lattice()[1]
 
     def _on_lattice(self) -> tuple[Tensor, Tensor]:
-        """Codes and positions, kept until anchors or bounds are others."""
+        """Return codes and positions, cached until anchors or bounds change."""
         # The objects, not their ids, which are used again. A version counts changes in place.
         state = (self.anchors, self.anchors._version, self.bounds, self.bounds._version)
         kept = self._lattice
@@ -111,71 +111,71 @@ class CodedAnchors(AnchorModel):
         return kept[1], kept[2]
 
     def lattice_places(self) -> tuple[Tensor, Tensor]:
-        """Codes [N,3] of the anchors on the 16-bit lattice, and where they are taken to be [N,3]."""
+        """Return codes [N,3] on the 16-bit lattice and the positions [N,3] that they decode to."""
         codes = position_codes(self.anchors, self.bounds)
         return codes, coded_positions(codes, self.bounds)
 
     # Masks
 
     def mask_weights(self) -> Tensor | None:
-        """[N,1] factors of sigmoid(mask_logits), or None for 1."""
+        """Return factors [N,1] of sigmoid(mask_logits), or None for 1."""
         return None
 
     def soft_masks(self) -> Tensor:
-        """[N,k] values that the threshold of the masks applies to; differentiable."""
+        """Return soft masks [N,k], which are thresholded into masks; differentiable."""
         soft, weights = torch.sigmoid(self.mask_logits), self.mask_weights()
         return soft if weights is None else soft * weights
 
     def masks(self, rows: Tensor | None = None) -> Tensor:
-        """[V,k] 0 or 1, with the gradient of `soft_masks`; None: all rows."""
+        """Return binary masks [V,k] with the gradient of `soft_masks`; rows None: all."""
         weights = self.mask_weights()
         masks = self._mask.forward(self.mask_logits, 1.0 if weights is None else weights)
         return masks if rows is None else masks[rows]
 
     @torch.no_grad()
     def kept(self) -> Tensor:
-        """[N] bool: anchors that keep a Gaussian; others are not in the file."""
+        """Return [N] bool: anchors with at least one unmasked Gaussian; the others are not in the file."""
         return (self.soft_masks() > MASK_THRESHOLD).any(dim=1)
 
     @torch.no_grad()
     def counts(self) -> dict[str, int]:
-        """Numbers of anchors and Gaussians that the file will have."""
+        """Return the numbers of anchors and Gaussians that the file will have."""
         masks = self.soft_masks() > MASK_THRESHOLD
         return {"num_anchors": int(masks.any(dim=1).sum()), "num_gaussians": int(masks.sum())}
 
     # Rendering
 
     def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
-        """The Gaussians of the visible anchors; `extras["rate"]` is the AnchorRate of a step in the last phase."""
+        """Return the Gaussians of the visible anchors; in the entropy phase `extras["rate"]` is the AnchorRate."""
         draw = replay.gaussians if replay.fits(self, CodedAnchors) else AnchorModel.gaussians
         return draw(self, camera, rasterizer)
 
     # Attributes
 
     def raw(self, rows: Tensor) -> Triple:
-        """Full-precision values of the groups, [V,C] each."""
+        """Return full-precision values of the groups, [V,C] each."""
         return self.features[rows], self.log_scales[rows].exp(), self.offsets[rows].flatten(1)
 
     @property
     def rate_model(self) -> RateModel:
-        """Return the rate model: it predicts steps and distributions, in training and for the file."""
+        """Return the rate model, which predicts quantiser steps and distributions in training and for the file."""
         return PredictedRate(self)
 
     def context_rows(self) -> Context:
-        """Return the tensors that the rate model predicts from, a row per anchor of the model."""
+        """Return the inputs of the rate model, one row per anchor of the model."""
         return (torch.arange(self.num_rows, device=self.device),)
 
     def context_of(self, rows: Tensor) -> Context:
-        """Return these tensors for the anchors `rows`."""
+        """Return the inputs of the rate model for the anchors `rows`."""
         return tuple(part.index_select(0, rows) for part in self.context_rows())
 
     @property
     def floors(self) -> Floors:
-        """Floors of the rate in training."""
+        """Return the lower bounds of scales and likelihoods in the training rate."""
         return Floors(self.smallest_probability, self.scale_floor)
 
     def attributes(self, rows: Tensor) -> AnchorAttributes:
-        """Full-precision, noisy or rounded attributes, by phase and mode; each of `rows` at most once."""
+        """Return full-precision, noisy or rounded attributes, by phase and mode; `rows` are unique."""
         if self.phase != FULL and not self.training:
             return self._rounded(rows)
         rate: dict[str, AnchorRate] = {}
@@ -192,7 +192,7 @@ class CodedAnchors(AnchorModel):
         return AnchorAttributes(positions, values.features, values.offsets, values.scales, values.masks, rate)
 
     def _with_rate_of_visible(self, rows: Tensor) -> tuple[NoisyValues, AnchorRate]:
-        """Noisy values of the anchors `rows`, and the rate of a sample of them.
+        """Return noisy values of the anchors `rows`, and the rate of a sample of them.
 
         Each is drawn with probability `sample`, and counts if it is kept. The bits of a masked offset do not count, its
         numbers do.
@@ -207,7 +207,7 @@ class CodedAnchors(AnchorModel):
         return values, AnchorRate.of(bits * share, by_group, counted.sum() * values.sample.shape[1], forecast)
 
     def _with_rate_of_all(self, rows: Tensor) -> tuple[NoisyValues, AnchorRate]:
-        """Noisy values of the anchors `rows`, and the rate of a sample of all anchors under noise of its own."""
+        """Return noisy values of the anchors `rows`, and the rate of a sample of all anchors with separate noise."""
         drawn = self.draw_sample(self.num_rows)
         sample = slice(len(rows), None)
         forecast = self.rate_model.forecast(self.context_of(torch.cat([rows, drawn])), sample)
@@ -219,7 +219,7 @@ class CodedAnchors(AnchorModel):
         return values, AnchorRate.of(bits, by_group, counted.sum() * own.sample.shape[1], forecast)
 
     def _values(self, rows: Tensor, noise: Noise | None, drawn: Tensor | None = None) -> NoisyValues:
-        """Values of the anchors `rows`; `sample` has those of its places `drawn`."""
+        """Return values of the anchors `rows`; `sample` holds those at the positions `drawn` in it."""
         tables, weights = self._tables, self.mask_weights()
         compute = fast_values.noisy_values if fast_values.fits(tables, weights) else noisy_values
         return compute(rows, tables, weights, MASK_THRESHOLD, noise, rows[:0] if drawn is None else drawn)
@@ -229,7 +229,7 @@ class CodedAnchors(AnchorModel):
         return self.features, self.log_scales, self.offsets, self.mask_logits
 
     def base_steps_like(self, like: Tensor) -> Tensor:
-        """[3] base steps on the device and in the dtype of `like`, kept there: made anew, they would be waited for."""
+        """Return base steps [3] with device and dtype of `like`, cached to avoid a host-device wait per step."""
         key = (like.device, like.dtype, tuple(self.base_steps))
         if key not in self._steps:
             self._steps[key] = like.new_tensor(self.base_steps)
@@ -237,7 +237,7 @@ class CodedAnchors(AnchorModel):
 
     @torch.no_grad()
     def _rounded(self, rows: Tensor) -> AnchorAttributes:
-        """Rounded attributes: what the file holds."""
+        """Return rounded attributes, as the file holds them."""
         steps = self.base_steps_like(self.features)[None]
         if self.phase == ENTROPY:
             steps = self.rate_model.forecast(self.context_of(rows), rows[:0]).steps
@@ -249,31 +249,31 @@ class CodedAnchors(AnchorModel):
 
     @torch.no_grad()
     def centres(self) -> Triple:
-        """Mean of each group over all numbers of the kept anchors: the index of a value is limited about it."""
+        """Return the mean of each group over the kept anchors; quantisation indices are clamped around it."""
         kept = self.raw(torch.nonzero(self.kept()).squeeze(1))
         return triple(v.double().mean() if v.numel() else v.new_zeros(()).double() for v in kept)
 
     # Draws
 
     def _draw_noise(self, rows: Tensor) -> Tensor:
-        """[V,C] draws of U(0,1) for all numbers of the anchors `rows`."""
+        """Return samples [V,C] of U(0,1) for all numbers of the anchors `rows`."""
         return self.draw_noise(len(rows), sum(self.shape.widths))
 
     def draw_noise(self, rows: int, numbers: int) -> Tensor:
-        """[rows, numbers] draws of U(0,1) for noise, see `noisy_values.draws`."""
+        """Return samples [rows, numbers] of U(0,1) for noise, see `noisy_values.draws`."""
         return draws((rows, numbers), self.own_generator(), self.device)
 
     def uniform(self, *shape: int) -> Tensor:
-        """Draws of U(0,1) on the model's device."""
+        """Return samples of U(0,1) on the model's device."""
         return torch.rand(shape, generator=self.own_generator(), device=self.device)
 
     def own_generator(self) -> torch.Generator | None:
-        """Generator of noise, if it draws on the model's device."""
+        """Return the noise generator if it is on the model's device."""
         own = self.noise is not None and self.noise.device.type == self.device.type
         return self.noise if own else None
 
     def draw_sample(self, count: int) -> Tensor:
-        """[S] int64 ascending: a sample of `count` anchors, drawn on the host: a GPU would have to count it."""
+        """Return a sample [S] int64, ascending, of `count` anchors; drawn on the host to avoid waiting for a GPU."""
         on_host = self.noise is None or self.noise.device.type == "cpu"
         where = "cpu" if on_host else self.device
         drawn = torch.rand(count, generator=self.noise, device=where) < self.sample

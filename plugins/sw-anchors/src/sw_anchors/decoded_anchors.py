@@ -1,4 +1,4 @@
-"""Anchors as they come out of a file: dequantised, with final masks, ready to render."""
+"""Anchor model decoded from a file: dequantised attributes, final masks, ready to render."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class DecodedAnchors(AnchorSplats):
-    """N anchors whose values are final; nothing is predicted or rounded when they are drawn.
+    """N anchors with final values; rendering predicts and rounds nothing.
 
     anchors     [N,3] world units
     features    [N,F]
@@ -31,7 +31,7 @@ class DecodedAnchors(AnchorSplats):
     def __init__(
         self, anchors: Tensor, features: Tensor, offsets: Tensor, scales: Tensor, masks: Tensor, *, hidden: int
     ) -> None:
-        """The networks are zero until their state is loaded."""
+        """Allocate the networks with zero weights; their state is loaded afterwards."""
         super().__init__()
         self.anchors, self.features = nn.Parameter(anchors), nn.Parameter(features)
         self.offsets, self.scales = nn.Parameter(offsets), nn.Parameter(scales)
@@ -43,7 +43,7 @@ class DecodedAnchors(AnchorSplats):
 
     @classmethod
     def zeros(cls, geometry: AnchorGeometry, shape: AnchorShape, *, hidden: int) -> DecodedAnchors:
-        """Anchors where `geometry` has them; attributes and networks are zero until they are read."""
+        """Make anchors at the positions of `geometry`, with zero attributes and networks to be filled."""
         n, k = len(geometry.codes), shape.offsets
         return cls(
             geometry.positions, torch.zeros(n, shape.features), torch.zeros(n, k, 3), torch.zeros(n, 6), geometry.masks,

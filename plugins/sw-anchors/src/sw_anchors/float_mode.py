@@ -1,4 +1,4 @@
-"""Coder mode `float`: distributions from networks evaluated in floats, so that the file is bound to its machine.
+"""Coder mode `float`: networks are evaluated in float, so a file decodes only on the same kind of machine.
 
 Encoder and decoder must get the very same floats. The other mode, `exact`, evaluates the networks in integers and
 decodes anywhere (docs/bitstream.md); methods offer `float` for comparison with published sizes.

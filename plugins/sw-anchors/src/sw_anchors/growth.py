@@ -1,4 +1,4 @@
-"""Growing and pruning of anchors: where new ones appear, which ones go, and by what statistics.
+"""Anchor growing and pruning: statistics, placement of new anchors, removal of transparent ones.
 
 Source: Scaffold-GS (arXiv 2312.00109) as used by HAC (arXiv 2403.14530), following the authors' code.
 """
@@ -17,12 +17,12 @@ from sw_anchors.anchors import AnchorModel, AnchorSelection
 from sw_anchors.fast import rows as fast_rows
 
 MAX_LOG_BASE_SCALE = 0.05
-"""Logarithms of the base scales (columns 3 to 5) above this are lowered to it at every adjustment."""
+"""Upper bound of the log base scales (columns 3 to 5), applied at every adjustment."""
 
 
 @dataclass(frozen=True)
 class GrowthReport:
-    """Counts of anchors that one adjustment grew and pruned."""
+    """Numbers of anchors grown and pruned in one adjustment."""
 
     grown: int
     pruned: int
@@ -127,7 +127,7 @@ def adjust_anchors(
 
 
 def _free_cells(points: Tensor, features: Tensor, anchors: Tensor, size: float) -> tuple[Tensor, Tensor]:
-    """(cells [M,3] that hold a point but no anchor, element-wise maximum of their points' features [M,F]).
+    """Return cells [M,3] with a point but no anchor, and the maximum of their points' features [M,F].
 
     points [P,3] and features [P,F] belong together; anchors [N,3]; cells are multiples of `size`, in sorted order.
     """
@@ -142,7 +142,7 @@ def _free_cells(points: Tensor, features: Tensor, anchors: Tensor, size: float) 
 
 
 def _unique_cells(cells: Tensor) -> tuple[Tensor, Tensor]:
-    """As `torch.unique(cells, dim=0, return_inverse=True)` of whole numbers [n,3], by one number a cell.
+    """Return `torch.unique(cells, dim=0, return_inverse=True)` of integers [n,3], via one key per cell.
 
     Rows are sorted alike and, on a CPU, fifty times as fast.
     """

@@ -1,4 +1,4 @@
-"""Header values that files of anchor methods share, checked as a stranger's must be."""
+"""Validated reading of header values that anchor methods share."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 def read_integers(
     reader: ContainerReader, key: str, *, low: int, high: int, longest: int, shortest: int = 1
 ) -> tuple[int, ...]:
-    """A list of `shortest` to `longest` integers in low..high. Raises BitstreamError."""
+    """Read a list of `shortest` to `longest` integers in low..high. Raises BitstreamError."""
     values: Any = reader.static.get(key)
     fits = isinstance(values, list) and shortest <= len(values) <= longest
     if not fits or any(type(v) is not int or not low <= v <= high for v in values):
@@ -25,7 +25,7 @@ def read_integers(
 
 
 def read_base_steps(reader: ContainerReader, *, low: float, high: float) -> tuple[float, float, float]:
-    """The header value `base_steps`: a quantiser step in low..high for each group. Raises BitstreamError."""
+    """Read `base_steps`: one quantiser step in low..high per group. Raises BitstreamError."""
     steps: Any = reader.static.get("base_steps")
     fits = isinstance(steps, list) and len(steps) == 3
     if not fits or any(type(q) not in (int, float) or not low <= q <= high for q in steps):

@@ -1,9 +1,9 @@
-"""The 16-bit lattice that anchors of compressed models lie on, in training and in the file alike.
+"""16-bit lattice of anchor positions, used in training and in the file.
 
-Position x of an axis with bounds lo, hi has the code v = floor((x - lo) / d), d = (hi - lo) / 65535, and is taken to be
-v d + lo. It is the floor since the published methods train with it. Arithmetic is float64 of stored float32 bounds, one
-operation at a time: codes give the same positions on every machine. Source: HAC (arXiv 2403.14530), without the 1e-6
-that its code adds to d: so the normalised coordinate of a code is v / 65535.
+On an axis with bounds lo, hi and step d = (hi - lo) / 65535, position x has the code v = floor((x - lo) / d) and
+decodes to v d + lo. Floor, not rounding, as the published methods train with it. Arithmetic is float64 on stored
+float32 bounds, one operation at a time, so codes decode to the same positions on every machine. Source: HAC (arXiv
+2403.14530), without the 1e-6 that its code adds to d: so the normalised coordinate of a code is v / 65535.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ FLAT_AXIS_STEP = 1e-6
 """Lattice step of an axis without extent, world units."""
 
 Margin = Literal["origin", "extent", "none"]
-"""Room around the anchors on their lattice, see `bounds_of`."""
+"""Margin of the lattice bounds around the anchors, see `bounds_of`."""
 
 
 def bounds_of(positions: Tensor, margin: Margin = "none") -> Tensor:
-    """Return low and high end of the lattice for positions [N,3], N > 0, as [2,3] float32.
+    """Return lattice bounds [2,3] float32 (low, high) for positions [N,3], N > 0.
 
     margin  "none"; "extent": 10 % of the extent at each end; "origin": a fifth of each end's distance from the origin,
-            as HAC has it, which is none where an end is 0 and much where the scene lies far out
+            as in HAC (no margin if an end is 0, a large one if the scene is far from the origin)
     """
     low, high = positions.detach().amin(dim=0), positions.detach().amax(dim=0)
     if margin == "origin":
@@ -38,19 +38,19 @@ def bounds_of(positions: Tensor, margin: Margin = "none") -> Tensor:
 
 
 def position_codes(positions: Tensor, bounds: Tensor) -> Tensor:
-    """Return the codes [N,3] int64 in 0..65535 of positions [N,3]; one outside the bounds is moved onto them."""
+    """Return codes [N,3] int64 in 0..65535; positions outside the bounds are clamped."""
     low, step = low_and_step(bounds)
     return torch.floor((positions.detach().to(torch.float64) - low) / step).clamp(0, TOP).to(torch.int64)
 
 
 def coded_positions(codes: Tensor, bounds: Tensor) -> Tensor:
-    """Return the positions [N,3] float32, world units, that codes [N,3] stand for."""
+    """Return positions [N,3] float32, world units, of lattice codes."""
     low, step = low_and_step(bounds)
     return (codes.to(torch.float64) * step + low).to(torch.float32)
 
 
 def low_and_step(bounds: Tensor) -> tuple[Tensor, Tensor]:
-    """Return low end [3] and step [3] of the lattice, float64 world units."""
+    """Return low end [3] and step [3] of the lattice, float64, world units; FLAT_AXIS_STEP on an axis of no extent."""
     low, high = bounds.to(torch.float64).unbind(0)
     step = (high - low) / TOP
     return low, torch.where(step > 0, step, torch.full_like(step, FLAT_AXIS_STEP))

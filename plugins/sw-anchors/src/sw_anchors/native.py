@@ -1,4 +1,4 @@
-"""The native module of anchors: the Gaussians that they spawn, and the gradient, on the CPU and on CUDA."""
+"""Native module of this package: spawning of Gaussians, forward and backward, on CPU and CUDA."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Neural Gaussians of a view: those with opacity > 0 that anchors spawn through three small networks.
+"""Neural Gaussians of a view: three small networks map anchors to Gaussians; those with opacity > 0 are kept.
 
 Source: Scaffold-GS (arXiv 2312.00109) as used by HAC (arXiv 2403.14530).
 """

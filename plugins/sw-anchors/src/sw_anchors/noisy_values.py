@@ -1,4 +1,4 @@
-"""Values of anchors as training sees them, with their masks: raw, or with uniform noise in place of rounding."""
+"""Anchor attributes in training: raw or with uniform noise in place of rounding, and their masks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sw_codecs.quantizers.binary import SteMask
 from sw_codecs.quantizers.rounding import add_noise
 
 FULL, QUANTIZED, ENTROPY = "full precision", "quantized training", "entropy training"
-"""Phases of training: raw values; noise of fixed steps; noise of predicted steps, with a rate."""
+"""Training phases: raw values; noise with fixed steps; noise with predicted steps, and a rate loss."""
 
 MASK_THRESHOLD = 0.01
 """A Gaussian is kept where its soft mask exceeds this."""
@@ -23,7 +23,7 @@ Tables = tuple[Tensor, Tensor, Tensor, Tensor]
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise of V anchors: step (u - 1/2) on every number, steps [1,3] or [V,3] of the groups.
+    """Noise of V anchors: step (u - 1/2) per number; steps [1,3] or [V,3], one per group.
 
     uniform     [V,C] draws u of U(0,1); they may be overwritten
     """
@@ -50,7 +50,7 @@ class NoisyValues:
 def noisy_values(
     rows: Tensor, tables: Tables, mask_weights: Tensor | None, threshold: float, noise: Noise | None, drawn: Tensor
 ) -> NoisyValues:
-    """Return values of the anchors `rows` [V], each at most once, with noise; differentiable.
+    """Return noisy values of the anchors `rows` [V], which are unique; differentiable.
 
     mask_weights    [N,1] or None for 1: a mask is 1 where sigmoid(logit) times its weight exceeds `threshold`, else 0;
                     its gradient is that of sigmoid(logit) times the weight, and none goes to the weight
@@ -67,7 +67,7 @@ def noisy_values(
 
 
 def draws(shape: tuple[int, int], generator: torch.Generator | None, device: torch.device) -> Tensor:
-    """Draw U(0,1) float32 of `shape` for noise: 16 bits each on a CPU, where 24 bits take three times as long."""
+    """Return U(0,1) float32 samples of `shape`; 16 random bits each on a CPU, where 24 bits take 3 times as long."""
     if device.type != "cpu":
         return torch.rand(shape, generator=generator, device=device)
     count = shape[0] * shape[1]

@@ -1,4 +1,4 @@
-"""Hyper-parameters of methods on anchors. Defaults are those of Scaffold-GS as HAC trains it."""
+"""Hyper-parameters of anchor methods. Defaults are those of Scaffold-GS as HAC trains it."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ RANDOM_START: Mapping[str, Any] = {
     "random_background_until": 1_500,
     "lr.mlp_opacity_early": 0.1,
 }
-"""Start of scenes in the Blender layout, which as a rule come without points (docs/methods/hac.md).
+"""Initialisation for scenes in the Blender layout, which usually have no points (docs/methods/hac.md).
 
-The authors of HAC draw 10,000 points where the folder holds none of an earlier 3DGS training, and take its 100,000
-where it does; their figures are those of the latter.
+The code of HAC samples 10,000 points, or takes the 100,000 points of an earlier 3DGS training if the folder has them.
+The published results match the latter.
 """
 
 
@@ -75,7 +75,7 @@ class AnchorGrowth(Params):
 
     @property
     def whole_voxels(self) -> bool:
-        """Whether cells of all levels are whole voxels, so that `subvoxel` changes nothing."""
+        """Whether cells of all levels are whole voxels, which makes `subvoxel` irrelevant."""
         return all(self.init_factor % self.hierarchy**level == 0 for level in range(self.levels))
 
     def normal(self, plugins: Any) -> AnchorGrowth:
@@ -91,10 +91,10 @@ class AnchorLoss(Params):
 
 
 class AnchorParams(OptimizationParams):
-    """Hyper-parameters of a method on anchors, to be subclassed."""
+    """Base of the hyper-parameters of an anchor method."""
 
     voxel_size: float = Field(0.001, description="edge of an anchor's cell, world units; <= 0: from the points")
-    num_offsets: int = Field(10, ge=1, le=64, description="Gaussians an anchor can spawn")
+    num_offsets: int = Field(10, ge=1, le=64, description="Gaussians per anchor")
     feature_dim: int = Field(50, ge=1, le=256, description="numbers in an anchor's feature")
     hidden: int = Field(50, ge=1, le=256, description="width of the networks that decode Gaussians")
     paired_offsets: bool = Field(

@@ -1,4 +1,4 @@
-"""A change of the model's phase as a task of the schedule."""
+"""Schedule task that switches the model's training phase."""
 
 from __future__ import annotations
 

@@ -21,10 +21,10 @@ Triple = tuple[Tensor, Tensor, Tensor]
 Context = tuple[Tensor, ...]
 """Inputs of a rate model: tensors with a row per anchor, without gradients, known before any attribute is decoded."""
 Rows: TypeAlias = "Tensor | slice"
-"""Some rows of a context: their int64 numbers, or a slice of all from one on."""
+"""Rows of a context: int64 indices, or a slice to the end."""
 
 SMALLEST_SCALE = 1e-9
-"""Floor of a predicted deviation, as published."""
+"""Lower bound of a predicted standard deviation, as published."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class AnchorForecast:
 
 @dataclass(frozen=True)
 class Floors:
-    """Floors of a rate in training.
+    """Lower bounds in the training rate.
 
     probability     of a value
     scale           of a predicted deviation, in quantiser steps; below it a gradient passes that would raise it.
@@ -60,7 +60,7 @@ PUBLISHED_FLOORS = Floors()
 
 
 class RateModel(Protocol):
-    """Distributions of the attributes of anchors.
+    """Protocol of rate models.
 
     A method's own class holds its grids and networks. `CodedAnchors.rate_model` gives it in training, the encoder asks
     the trained model for it, and the decoder builds it from the file.
@@ -83,7 +83,7 @@ class RateModel(Protocol):
         ...
 
     def exact(self) -> object:
-        """Return the same distributions in integers, equal on every machine: what the method's file is coded with."""
+        """Return the same distributions in integers, identical on every machine, for coding the file."""
         ...
 
 
@@ -118,7 +118,7 @@ class AnchorRate:
 
     @classmethod
     def of(cls, bits: Tensor, by_group: Tensor, numbers: Tensor, forecast: AnchorForecast) -> AnchorRate:
-        """Return the rate of a sample of so many bits and numbers."""
+        """Return the rate of a sample from its bits and its count of numbers."""
         return cls(bits / numbers.clamp(min=1), by_group, numbers, forecast.own_bits)
 
 
@@ -167,7 +167,7 @@ def _shape(values: Tensor, masks: Tensor) -> AnchorShape:
 
 
 def floored(scale: Tensor, steps: Tensor, floors: Floors) -> Tensor:
-    """Raise predicted deviations [S,C] to their floor, for quantiser steps [S,C]; differentiable.
+    """Clamp predicted standard deviations [S,C] from below, for quantiser steps [S,C]; differentiable.
 
     A deviation at SMALLEST_SCALE has no gradient: a column that starts there for all anchors never learns.
     """

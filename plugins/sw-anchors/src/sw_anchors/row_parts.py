@@ -1,7 +1,7 @@
-"""Contexts of a file computed for a few rows at a time: the widths that its header claims decide no memory.
+"""Row-wise evaluation in parts of bounded size, so that widths claimed by a file cannot exhaust memory.
 
-A block of symbols has up to 2^20 numbers, so as many rows as its columns are few; the context of a row has thousands of
-numbers where a header says so. What leaves a network is as wide as the block, what goes in is not.
+A block of symbols has at most 2^20 numbers, so a narrow block has many rows. The context per row may have thousands of
+numbers if a header says so, and only the network's outputs are as narrow as the block.
 """
 
 from __future__ import annotations
@@ -10,22 +10,22 @@ from collections.abc import Callable
 
 from torch import Tensor
 
-EXACT_NUMBERS = 1 << 20
-"""Most numbers of a context at once in mode `exact`, whose results do not depend on it."""
-FLOAT_NUMBERS = 1 << 24
-"""The same in mode `float`, whose products may: so many that contexts of up to 800 numbers a row are never cut."""
+MAX_EXACT_NUMBERS = 1 << 20
+"""Largest count of context numbers per part in mode `exact`; results do not depend on it."""
+MAX_FLOAT_NUMBERS = 1 << 24
+"""The same in mode `float`, where results may depend on it: contexts up to 800 numbers per row are never split."""
 
 
 def parts_of(rows: Tensor, width: int, numbers: int) -> tuple[Tensor, ...]:
-    """`rows` cut into parts of at most numbers // width rows, where a row has `width` numbers on its way."""
+    """Split `rows` into parts of at most numbers // width rows; `width`: intermediate numbers per row."""
     return rows.split(max(1, numbers // width))
 
 
 def by_parts(evaluate: Callable[[Tensor], Tensor], rows: Tensor, width: int, numbers: int) -> Tensor:
-    """`evaluate(rows)` of a function that treats each row alone, at most numbers // width rows at a time.
+    """Return `evaluate(rows)` of a row-wise function, computed numbers // width rows at a time.
 
     rows        [n, ...]
-    width       the most numbers a row has on the way through `evaluate`
+    width       largest count of numbers per row inside `evaluate`
     """
     parts = iter(parts_of(rows, width, numbers))
     first = evaluate(next(parts))

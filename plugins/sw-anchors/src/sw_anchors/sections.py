@@ -1,7 +1,7 @@
-"""Sections of an anchor file for geometry and networks: where anchors are, which Gaussians they keep, all weights.
+"""File sections of an anchor model's geometry (positions, offset masks) and network weights.
 
-Section `anchors`: six little-endian float32 (bounds: low x y z, high x y z), then the 16-bit codes of the
-positions by the position codec `octree`, which fixes the order of all rows. Section `masks`: one symbol per offset,
+Section `anchors`: six little-endian float32 (bounds: low x y z, high x y z), then the 16-bit position codes, coded by
+`octree`; they fix the order of all rows. Section `masks`: one symbol per offset,
 anchor by anchor, by the entropy model `bernoulli`. Section `networks`: every weight and bias in the order of
 `named_parameters`, float32 or float16.
 """
@@ -49,12 +49,12 @@ class AnchorGeometry:
 
 
 def morton_order(codes: Tensor) -> Tensor:
-    """[N] int64: the order of rows in the file, for position codes [N,3]."""
+    """Return the row order of the file, [N] int64, for position codes [N,3]."""
     return torch.argsort(interleave(codes.cpu()), stable=True)
 
 
 def kept_geometry(model: CodedAnchors) -> tuple[AnchorGeometry, Tensor]:
-    """The anchors of a model that its file has, in the order of the file; and their rows [N] in the model."""
+    """Return the geometry of the kept anchors in file order, and their rows [N] in the model."""
     kept = torch.nonzero(model.kept()).squeeze(1)
     rows = kept[morton_order(model.codes()[kept]).to(kept.device)]
     geometry = AnchorGeometry(model.bounds.cpu(), model.codes()[rows].cpu(), model.masks(rows).detach().cpu() > 0.5)
@@ -94,7 +94,7 @@ def read_geometry(reader: ContainerReader, plugins: PluginManager, *, bytes_per_
 
 
 def read_counts(reader: ContainerReader, *, bytes_per_anchor: int) -> tuple[int, int, int]:
-    """Header values num_anchors, num_offsets and num_gaussians. Raises BitstreamError."""
+    """Read the header values num_anchors, num_offsets and num_gaussians. Raises BitstreamError."""
     n = reader.integer("num_anchors", low=0, high=(1 << 32) - 1)
     k = reader.integer("num_offsets", low=1, high=64)
     gaussians = reader.integer("num_gaussians", low=n, high=n * k)
@@ -103,7 +103,7 @@ def read_counts(reader: ContainerReader, *, bytes_per_anchor: int) -> tuple[int,
 
 
 def read_bounds(data: bytes | memoryview) -> Tensor:
-    """[2,3] float32 at the start of a section. Raises BitstreamError unless they are finite and in order."""
+    """Read bounds [2,3] float32 from the start of a section. Raises BitstreamError unless finite and in order."""
     if len(data) < BOUNDS_BYTES:
         raise BitstreamError("ends within the bounds of the anchors")
     bounds = torch.from_numpy(np.frombuffer(data[:BOUNDS_BYTES], "<f4").astype(np.float32).reshape(2, 3))
@@ -113,7 +113,7 @@ def read_bounds(data: bytes | memoryview) -> Tensor:
 
 
 def read_masks(reader: ContainerReader, plugins: PluginManager, n: int, k: int, gaussians: int) -> Tensor:
-    """[n,k] bool from the section `masks`, `gaussians` of them set, at least one a row. Raises BitstreamError."""
+    """Read masks [n,k] bool, `gaussians` of them True, at least one per row. Raises BitstreamError."""
     with reader.decoding("masks") as data:
         symbols = plugins.entropy_models.load("bernoulli")().decode(data, n * k)
         masks = torch.from_numpy(symbols.reshape(n, k) > 0)
@@ -135,14 +135,14 @@ def add_networks(writer: ContainerWriter, networks: Mapping[str, nn.Module], wei
 
 @torch.no_grad()
 def round_networks(networks: Mapping[str, nn.Module], weights: WeightType) -> None:
-    """Give every weight the value that the file has, in place."""
+    """Round every weight, in place, to its value in the file."""
     for _, parameter in _parameters(networks):
         parameter.copy_(parameter.to(getattr(torch, weights)))
 
 
 @torch.no_grad()
 def read_networks(reader: ContainerReader, networks: Mapping[str, nn.Module]) -> None:
-    """Fill networks of the right shapes from the section, in place. Raises BitstreamError."""
+    """Load the weights of the section into networks of matching shapes, in place. Raises BitstreamError."""
     dtype = np.dtype(reader.text("weights", choices=WEIGHT_TYPES)).newbyteorder("<")
     with reader.decoding("networks") as data:
         expected = sum(p.numel() for _, p in _parameters(networks)) * dtype.itemsize

@@ -1,4 +1,4 @@
-"""Sizes of an anchor: how many numbers its three coded groups have, and what a context network says of them."""
+"""Sizes per anchor: numbers in its three coded groups, and outputs of a context network."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ GROUPS = ("features", "scales", "offsets")
 
 @dataclass(frozen=True)
 class AnchorShape:
-    """F features and k offsets of an anchor; methods add the sizes of their context models.
+    """Sizes per anchor: F features, k offsets; methods add the sizes of their context models.
 
     features    F
     offsets     k, Gaussians that an anchor can spawn
@@ -24,7 +24,7 @@ class AnchorShape:
 
     @property
     def widths(self) -> tuple[int, int, int]:
-        """Numbers of an anchor by group."""
+        """Numbers per anchor in each group."""
         return self.features, 6, 3 * self.offsets
 
     @property
@@ -34,19 +34,19 @@ class AnchorShape:
 
     @property
     def decoded_bytes(self) -> int:
-        """Bytes of one decoded anchor: position, groups and masks."""
+        """Bytes per decoded anchor: position, groups and masks."""
         return 4 * (3 + sum(self.widths)) + self.offsets
 
     def widened(self, steps: Tensor) -> Tensor:
-        """Return steps [V,3] of the groups for each of their numbers, [V, sum(widths)]; differentiable."""
+        """Expand steps per group [V,3] to steps per number [V, sum(widths)]; differentiable."""
         parts = zip(steps.split(1, dim=1), self.widths, strict=True)
         return torch.cat([step.expand(-1, width) for step, width in parts], dim=1)
 
     def joined(self, features: Tensor, scales: Tensor, offsets: Tensor) -> Tensor:
-        """Return factors [S,1], [S,1] and [S,k] of the groups for each of their numbers, [S, sum(widths)]."""
+        """Expand factors per group [S,1], [S,1], [S,k] to factors per number [S, sum(widths)]."""
         threefold = offsets[:, :, None].expand(-1, -1, 3).flatten(1)
         return torch.cat([features.expand(-1, self.features), scales.expand(-1, 6), threefold], dim=1)
 
     def sums(self, numbers: Tensor) -> Tensor:
-        """Return the sum over each group of numbers [S, sum(widths)], [3]."""
+        """Return sums per group, [3], of numbers [S, sum(widths)]."""
         return torch.stack([part.sum() for part in numbers.split(list(self.widths), dim=1)])

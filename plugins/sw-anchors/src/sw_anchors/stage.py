@@ -1,4 +1,4 @@
-"""Training stages of methods on anchors: `AnchorStage` for a plain model, `CodedAnchorStage` for one with a rate.
+"""Training stages of anchor models: `AnchorStage` (Scaffold-GS), `CodedAnchorStage` (with masks and a rate).
 
 Source: Scaffold-GS (arXiv 2312.00109) as trained by HAC (arXiv 2403.14530); the plan is that of the Splatwizard paper.
 """
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 
 Weighted = tuple[float, "Tensor"]
-"""Weight of a scalar in a sum, and the scalar."""
+"""A weight and the scalar that it multiplies."""
 
 
 class AnchorStage(Stage):
@@ -64,7 +64,7 @@ class AnchorStage(Stage):
         self.extent = 1.0  # known when the stage begins; a plan can be printed without a scene
 
     def at(self, step: int) -> int:
-        """Scale one step of the full run, or a number of steps that a task counts by itself, as `when` does."""
+        """Scale a step, or a step count, of the full schedule to this run, as `when` does."""
         found = self.when(step)
         assert isinstance(found, int)
         return found
@@ -97,7 +97,7 @@ class AnchorStage(Stage):
         return exponential_lr(step, init=init, final=final, max_steps=self.at(last))
 
     def learning_rates(self, step: int) -> Mapping[str, float]:
-        """Learning rate of each parameter or submodule, by name: the optimizer's groups, the same at every step."""
+        """Return the learning rate per parameter or submodule, by name; the names are the optimizer's groups."""
         lr = self.opt.lr
         # An anchor whose opacities are all negative is never drawn again. All anchors of a random start have equal
         # features and most of them lie in empty space: at its full rate the network turns down all of them together.
@@ -119,7 +119,7 @@ class AnchorStage(Stage):
 
     @property
     def adjustments(self) -> list[range]:
-        """Steps of this run that grow and prune anchors, before the pause and after it."""
+        """Return the steps of this run that grow and prune anchors, before and after the pause."""
         growth = self.opt.growth
         pause_end = max(growth.start, growth.pause_start, growth.pause_end)
         found = []
@@ -144,7 +144,7 @@ class AnchorStage(Stage):
             optimizer.set_lr(name, lr)
 
     def collect_gradient_statistics(self, model: AnchorModel, result: RenderResult, step: int) -> None:
-        """Add this view to the statistics that growing and pruning go by."""
+        """Add this view to the statistics for growing and pruning."""
         if step > self.at(self.opt.growth.start_stat):
             assert result.grad2d is not None
             accumulate_anchor_statistics(model, result.extras["anchors"], result.grad2d.value, result.radii)
@@ -172,11 +172,11 @@ class AnchorStage(Stage):
         return RasterOptions(background=background, grad2d=True)
 
     def extra_loss(self, model: Any, result: RenderResult, step: int) -> Mapping[str, Weighted | Tensor]:
-        """Further terms of the loss by name: a scalar, or its weight and the scalar, which costs a GPU less."""
+        """Return further loss terms by name: a scalar, or (weight, scalar), which needs fewer GPU launches."""
         return {}
 
     def mean_volume(self, result: RenderResult) -> Tensor:
-        """Mean product of the scales of what is drawn, scalar; differentiable."""
+        """Return the mean volume (product of scales) of the rendered Gaussians, a scalar; differentiable."""
         assert result.inputs.scales is not None
         mean = fast_loss.mean_product if fast_enabled() else mean_product
         return mean(result.inputs.scales)
@@ -192,18 +192,18 @@ class AnchorStage(Stage):
 
 
 def mean_product(scales: Tensor) -> Tensor:
-    """Mean over the rows of scales [M,3] of their product, 0 for none; a scalar, differentiable."""
+    """Return the mean over rows of the product of scales [M,3], 0 if M = 0; a scalar, differentiable."""
     return scales.prod(dim=1).sum() / max(len(scales), 1)
 
 
 def weighted_sum(start: Tensor, *terms: Weighted) -> tuple[Tensor, ...]:
-    """(start plus all terms times their weights; the weighted terms, without gradient); all of them scalars."""
+    """Return (start + sum of weight times term, the weighted terms without gradient), all scalars."""
     weighted = [weight * term for weight, term in terms]
     return start + sum(weighted), *(each.detach() for each in weighted)
 
 
 class CodedAnchorStage(AnchorStage):
-    """Trains a CodedAnchors: also its masks, and the lattice of its positions is fitted at step 1.
+    """Trains a CodedAnchors: adds mask learning, and fits the position lattice at step 1.
 
     A method adds the switches of phase (`PhaseSwitch(step, QUANTIZED)`, ...), its context model and the rate term.
     """
@@ -226,7 +226,7 @@ class CodedAnchorStage(AnchorStage):
         return {"offsets": rates["offsets"], "mask_logits": self.mask_rate(step) * self.extent, **rates}
 
     def mask_rate(self, step: int) -> float:
-        """Learning rate of the mask logits over the scene extent."""
+        """Return the learning rate of the mask logits per scene extent."""
         return self.decay(step, self.opt.lr.masks_init, self.opt.lr.masks_final)
 
     def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
@@ -234,5 +234,5 @@ class CodedAnchorStage(AnchorStage):
         scheduler.register_task(1, self.update_anchor_bound)
 
     def update_anchor_bound(self, model: CodedAnchors) -> None:
-        """Fit the lattice of the positions to the anchors of now."""
+        """Fit the position lattice to the current anchors."""
         model.update_bounds()

@@ -1,4 +1,4 @@
-"""Checks for the tests of methods on anchors: the fast forms of a training step against the plain one.
+"""Test helpers for anchor methods: compare the fast versions of a training step with the plain one.
 
 def test_fast_forms_change_nothing():
     check_plain(make_model, camera, counts=(0, 1, 40))

@@ -12,7 +12,7 @@ import torch
 from sw_anchors.attribute_sections import ExactNetwork
 from sw_anchors.float_mode import Mode
 from sw_anchors.rate_model import PUBLISHED_FLOORS, AnchorForecast, Context, Floors, Rows, gaussian_rate
-from sw_anchors.row_parts import FLOAT_NUMBERS, by_parts
+from sw_anchors.row_parts import MAX_FLOAT_NUMBERS, by_parts
 from sw_anchors.shape import GROUPS
 from torch import Tensor
 
@@ -115,13 +115,13 @@ class FloatPredictor:
     def first(self, places: Tensor) -> dict[str, RowContext]:
         """Distributions by group that the position alone gives."""
         width = max(self.context.triplane.width, self.context.shape.hidden)
-        found = self.context.read(by_parts(self.context.outputs, places, width, FLOAT_NUMBERS))
+        found = self.context.read(by_parts(self.context.outputs, places, width, MAX_FLOAT_NUMBERS))
         return {g: RowContext(found.means[i], found.scales[i], found.steps[i]) for i, g in enumerate(GROUPS)}
 
     def shift(self, name: str, known: Tensor) -> tuple[Tensor, Tensor]:
         """Changes of mean and scale that the network `name` of the slices makes of the known features."""
         network = self.context.slices.networks[name]
-        mean, scale = by_parts(network, known, self.context.shape.slice_hidden, FLOAT_NUMBERS).chunk(2, dim=1)
+        mean, scale = by_parts(network, known, self.context.shape.slice_hidden, MAX_FLOAT_NUMBERS).chunk(2, dim=1)
         return mean, scale
 
     def known(self, symbols: Tensor, context: RowContext) -> Tensor:

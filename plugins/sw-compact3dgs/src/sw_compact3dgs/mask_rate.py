@@ -36,7 +36,7 @@ class MaskRate:
         return 4 * HALF_BITS + 2 * self.stages * max((self.size - 1).bit_length(), 1)
 
     def forecast(self, logits: Tensor) -> Tensor:
-        """How far each row is expected in the file, [N] in 0..1; differentiable."""
+        """Return the probability that each row is in the file, [N] in 0..1; differentiable."""
         return torch.sigmoid(logits)
 
     def rate(self, rows: Tensor) -> Tensor:

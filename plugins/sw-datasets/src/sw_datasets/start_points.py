@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from sw_gaussians.mapped import mapped
+from sw_gaussians.memory_map import memory_map
 from sw_gaussians.ply_tables import MAX_HEADER, read_header, read_tables
 from torch import Tensor
 
@@ -88,7 +88,7 @@ def read_cloud(path: Path) -> PointCloud:
 
     Raises SceneError for what is no such file.
     """
-    data = mapped(path)
+    data = memory_map(path)
     try:
         header = read_header(bytes(data[:MAX_HEADER]), len(data), path.name)
         count, names = header.count("vertex"), header.names("vertex")

@@ -1,1 +1,1 @@
-"""Training explicit Gaussians: the stage of 3DGS, its density control, and that of 3DGS-MCMC."""
+"""Training of explicit Gaussians: the 3DGS stage, density controls (ADC, MCMC, budget), and fine-tuning."""

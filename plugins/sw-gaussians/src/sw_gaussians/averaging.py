@@ -1,23 +1,23 @@
-"""Averages of a model over the last steps of a training: less of the noise that one view at a time leaves."""
+"""Parameter averaging over the last training steps, which reduces the noise of single-view gradients."""
 
 from splatwizard_core.api import SplatModel, SplatOptimizer
 
 SAMPLE_EVERY = 10
-"""Steps between two samples, fewer if the share begins later: reading parameters takes a hundredth of a step."""
+"""Largest number of steps between two samples; reading the parameters costs about 1 % of a step."""
 AVERAGE = "average"
-"""Key of a parameter's state: its mean so far, of the parameter's shape."""
+"""Key in the optimizer state of a parameter: its running mean, same shape as the parameter."""
 
 
 class AverageParameters:
-    """Makes a model the mean of itself over the last steps, each sample with the same weight.
+    """Replaces the parameters by their mean over samples from the last steps, all weighted equally.
 
     first, last     steps of the first and the last sample; after the last the model is the mean
     every           steps between two samples
 
     The training goes on from the model itself, not from the mean, until the last step. Means are part of the
     optimizer's state: they follow rows that go or are put in another order, and are in checkpoints. Rows that come in
-    between would be averaged with zeros, so `first` belongs after the last densification. What nothing has updated
-    stays as it is.
+    between would be averaged with zeros, so `first` belongs after the last densification. Parameters without
+    any update stay unchanged.
     Raises ValueError if `first` is not a whole number of samples before `last`.
     Source: stochastic weight averaging (arXiv 1803.05407).
     """

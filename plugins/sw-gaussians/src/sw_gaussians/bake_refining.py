@@ -1,4 +1,4 @@
-"""Baked Gaussians brought nearer to the model that they stand for: a short training on its own pictures."""
+"""Refinement of baked Gaussians: a short training on renders of the model that they replace."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 STEP_SIZES = {
     "sh_dc": 2.5e-3, "sh_rest": 2.5e-4, "opacity_logits": 0.02, "log_scales": 3e-3, "quats": 1e-3,
 }  # fmt: skip
-"""Of Adam, those of late 3DGS training; positions, which do not depend on the camera, stay."""
+"""Adam learning rates, those of late 3DGS training. Positions do not depend on the camera and stay fixed."""
 
 
 def refine(
@@ -30,7 +30,7 @@ def refine(
     steps: int,
     generator: torch.Generator,
 ) -> None:
-    """Train what was baked, in place, for a number of steps, each on the picture that the model shows one camera.
+    """Train baked Gaussians in place; each step fits the model's render from one camera.
 
     cameras     on any device; drawn from at random by `generator`
     options     as both are drawn

@@ -1,8 +1,8 @@
-"""Explicit Gaussians of a model whose Gaussians depend on the camera: fitted to what given cameras see.
+"""Baking: fit explicit Gaussians to a model whose Gaussians depend on the camera, over given cameras.
 
-Every viewer and every interchange format takes explicit Gaussians; anchors with small networks (Scaffold-GS, HAC) are
-none. Positions do not depend on the camera. Opacity, scale, rotation and colour do: of each Gaussian they are fitted
-over the cameras that see it, the first three as means, the colour as spherical harmonics by least squares.
+Viewers and interchange formats need explicit Gaussians; anchors with small networks (Scaffold-GS, HAC) are not.
+Positions do not depend on the camera. Opacity, scale, rotation and colour do, so they are fitted per Gaussian over the
+cameras that see it: the first three as weighted means, the colour as spherical harmonics by least squares.
 """
 
 from __future__ import annotations
@@ -33,37 +33,37 @@ if TYPE_CHECKING:
     from splatwizard_core.api import Rasterizer
 
 BLEND = ScoreSpec("blend", "blend")
-"""Sum over pixels of alpha times transmittance: how much of a picture is one Gaussian's."""
-FAINTEST = 1 / 255
-"""Opacity below which nothing is drawn."""
-OPAQUE = 1 - 1e-5
-"""Largest opacity: that of 1 has no finite logit."""
-UNSEEN = 1e-3
-"""Weight of a view in which a Gaussian is hidden, in pixels: it decides only where all views hide it."""
+"""Name of the score that weights views: sum over pixels of alpha times transmittance."""
+MIN_OPACITY = 1 / 255
+"""Opacity below which a Gaussian is not drawn."""
+MAX_OPACITY = 1 - 1e-5
+"""Largest opacity; an opacity of 1 has no finite logit."""
+HIDDEN_VIEW_WEIGHT = 1e-3
+"""Weight, in pixels, of a view in which a Gaussian is hidden; it matters only if all views hide it."""
 RIDGE = 0.005
-"""Pull of the higher bands towards 0, in shares of the weight of all views: few views do not fix many bands."""
-AT_ONCE = 1 << 15
-"""Gaussians whose equations are solved in one call."""
+"""Ridge regularisation of the higher SH bands, as a share of the total view weight."""
+SOLVE_BATCH = 1 << 15
+"""Number of Gaussians whose least-squares systems are solved per call."""
 
 
 @runtime_checkable
 class NumbersGaussians(Protocol):
-    """A model that draws other Gaussians in each view, and says which they are."""
+    """A model whose Gaussians differ per view, and which numbers them across views."""
 
     @property
     def num_gaussian_ids(self) -> int:
-        """Number of Gaussians that there can be."""
+        """Largest number of Gaussians, over all views."""
         ...
 
     def gaussian_ids(self, inputs: GaussianInputs) -> Tensor:
-        """[M] int64, 0 .. num_gaussian_ids - 1, each once: which Gaussians of the model those of one view are."""
+        """Return the ids [M] int64, unique, in 0 .. num_gaussian_ids - 1, of the Gaussians of one view."""
         ...
 
 
 def bake(
     model: SplatModel, cameras: Sequence[Camera], rasterizer: Rasterizer, options: RasterOptions, *, sh_degree: int = 2
 ) -> GaussianModel:
-    """Return explicit Gaussians that look from `cameras` like the model, as far as such can; on the model's device.
+    """Return explicit Gaussians, on the model's device, that approximate its renders from `cameras`.
 
     cameras     at least one, on any device; Gaussians that none of them sees are left out
     options     as the model is drawn
@@ -95,14 +95,14 @@ def bake(
         fit = _Fit(means, slots, sh_degree)
         for view in views():
             blend = rasterizer.render(guess, view.camera, blending).scores[BLEND.name]
-            fit.add(view, blend / guess.opacities.clamp_min(FAINTEST) + UNSEEN)
+            fit.add(view, blend / guess.opacities.clamp_min(MIN_OPACITY) + HIDDEN_VIEW_WEIGHT)
         found = fit.shapes()
         return _model(replace(found, sh=SH(dense=fit.harmonics())))
 
 
 @dataclass(frozen=True)
 class _View:
-    """The M Gaussians that one camera draws: which of the model's they are [M], and their colours [M,3]."""
+    """The M Gaussians that one camera draws: their ids [M] and colours [M,3]."""
 
     ids: Tensor
     inputs: GaussianInputs
@@ -126,7 +126,7 @@ def _view(model: SplatModel, camera: Camera, rasterizer: Rasterizer) -> _View:
 
 
 def _positions(views: Iterable[_View], count: int) -> tuple[Tensor, Tensor]:
-    """Of the N Gaussians that some view draws: id -> number [count] int64 (-1: never drawn), and their means [N,3]."""
+    """Number the N Gaussians that any view draws: id -> row [count] int64 (-1: never drawn), and their means [N,3]."""
     means: Tensor | None = None
     for view in views:
         if means is None:
@@ -141,7 +141,7 @@ def _positions(views: Iterable[_View], count: int) -> tuple[Tensor, Tensor]:
 
 
 def _in_picture(means: Tensor, camera: Camera) -> Tensor:
-    """[N] bool: means within the picture."""
+    """Return [N] bool: whether a mean projects into the image."""
     x, y, z = (means @ camera.R.T + camera.tau).unbind(1)
     tx, ty = camera.tan_half_fov
     return (z > camera.near) & (x.abs() < tx * z) & (y.abs() < ty * z)
@@ -166,7 +166,7 @@ class _Fit:
         self._colors = means.new_zeros(n, self._terms, 3)  # sum of w b (c - 0.5)
 
     def add(self, view: _View, weights: Tensor) -> None:
-        """Count a view with the weights [N] of all Gaussians, also of those that it does not draw: opacity 0 there."""
+        """Add a view with the weights [N] of all Gaussians; those it does not draw count with opacity 0."""
         own = self.slots[view.ids]
         known = own >= 0  # all but those whose mean is not finite
         rows, inputs = own[known], view.inputs
@@ -174,7 +174,7 @@ class _Fit:
         assert inputs.quats is not None
         opacities = inputs.opacities[known]
         seen = weights.clone()
-        seen[rows] = seen[rows].clamp_min(UNSEEN)
+        seen[rows] = seen[rows].clamp_min(HIDDEN_VIEW_WEIGHT)
         self._weight += seen
         shown = seen[rows] * opacities  # [M] what of it is in the picture
         self._opacity[rows] += shown
@@ -189,22 +189,24 @@ class _Fit:
             self._colors[rows] += (shown[:, None] * basis)[:, :, None] * (view.colors[known] - 0.5)[:, None]
 
     def shapes(self) -> GaussianInputs:
-        """The Gaussians, grey: opacity, scale and rotation are those of the mean view."""
+        """Return grey Gaussians whose opacity, scale and rotation are the weighted means over the views."""
         shown = self._opacity.clamp_min(1e-20)[:, None]
-        opacities = (self._opacity / self._weight.clamp_min(1e-20)).clamp(0, OPAQUE)
+        opacities = (self._opacity / self._weight.clamp_min(1e-20)).clamp(0, MAX_OPACITY)
         quats = normalize(self._quats, dim=1)
         return GaussianInputs(
             self.means, opacities, (self._log_scales / shown).exp(), quats, colors=torch.full_like(self.means, 0.5)
         )
 
     def harmonics(self) -> Tensor:
-        """[N,K,3] the coefficients nearest to the colours of the views."""
+        """Return SH coefficients [N,K,3], the least-squares fit to the colours of the views."""
         shown = self._opacity.clamp_min(1e-20)[:, None]
         ridge = self.means.new_full((self._terms,), RIDGE)
         ridge[0] = 1e-6
         found = []
         for products, colors in zip(
-            (self._products / shown).split(AT_ONCE), (self._colors / shown[:, :, None]).split(AT_ONCE), strict=True
+            (self._products / shown).split(SOLVE_BATCH),
+            (self._colors / shown[:, :, None]).split(SOLVE_BATCH),
+            strict=True,
         ):
             matrix = products.new_zeros(len(products), self._terms, self._terms)
             matrix[:, self._upper[0], self._upper[1]] = products
@@ -214,11 +216,11 @@ class _Fit:
 
 
 def _model(g: GaussianInputs) -> GaussianModel:
-    """The raw parameters of those that are not too faint to be drawn."""
+    """Return a model of raw parameters, without Gaussians too transparent to be drawn."""
     assert g.sh is not None
     assert g.scales is not None
     assert g.quats is not None
-    kept = g.opacities >= FAINTEST
+    kept = g.opacities >= MIN_OPACITY
     if not kept.any():
         raise SceneError("no Gaussian is opaque enough to be drawn, so there is nothing to bake")
     sh = g.sh.to_dense()[kept]

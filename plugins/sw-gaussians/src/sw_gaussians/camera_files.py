@@ -1,4 +1,4 @@
-"""Files of cameras: `cameras.json` as the code of 3DGS writes it, and camera paths of nerfstudio's viewer."""
+"""Camera files: `cameras.json` of the 3DGS code, and camera paths of the nerfstudio viewer."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from splatwizard_core.api import Camera, SceneError
 LARGEST_FILE = 64 << 20  # bytes; a camera takes 400
 MOST_CAMERAS = 100_000
 LARGEST_SIDE = 16_384  # pixels
-LOOSE = 1e-2
-"""By how much entries of R R^T may differ from the identity: files have few digits. R is then made exact."""
+ROTATION_TOLERANCE = 1e-2
+"""Tolerance per entry of R R^T - I: files store few digits. R is orthonormalised afterwards."""
 
 
 @dataclass(frozen=True)
 class CameraFile:
-    """Cameras of a file in its order, and the frames a second that it asks for, or None."""
+    """Cameras in file order, and the frames per second that the file asks for, or None."""
 
     cameras: list[Camera]
     fps: float | None = None
@@ -32,11 +32,13 @@ class CameraFile:
 def read_cameras(path: str | Path) -> CameraFile:
     """Read a list of cameras, at least one.
 
-    A list of {"width", "height", "fx", "fy", "position" [3], "rotation" [3][3]} is a cameras.json of 3DGS: pixels, the
-    camera's centre in the world, and the rotation from camera to world in OpenCV axes (x right, y down, z forward);
-    "cx" and "cy" in pixels may stand beside them, else the centre. An object with "camera_path" is nerfstudio's:
-    "render_width", "render_height", "fps", and a list of {"camera_to_world" [16] by rows in OpenGL axes (x right, y up,
-    z backward), "fov" vertical, degrees}; it holds in the frame that nerfstudio gave the scene.
+    cameras.json of 3DGS is a list of {"width", "height", "fx", "fy", "position" [3], "rotation" [3][3]}, in pixels.
+    "position" is the camera centre, "rotation" maps camera to world in OpenCV axes (x right, y down, z forward).
+    "cx" and "cy" in pixels are optional (default: the image centre).
+
+    A nerfstudio path is an object with "render_width", "render_height", "fps" and "camera_path". The latter is a list
+    of {"camera_to_world" [16] by rows in OpenGL axes (x right, y up, z backward), "fov" vertical, degrees}, in the
+    frame that nerfstudio gave the scene.
 
     Raises SceneError with the place of what is wrong.
     """
@@ -101,8 +103,8 @@ def _camera(
 
 
 def _rotation(matrix: NDArray[np.float64], place: str) -> NDArray[np.float64]:
-    """The rotation next to a matrix that nearly is one. Raises SceneError for another matrix."""
-    if abs(matrix @ matrix.T - np.eye(3)).max() > LOOSE or np.linalg.det(matrix) <= 0:
+    """Return the nearest rotation [3,3] of a nearly orthonormal matrix. Raises SceneError for any other matrix."""
+    if abs(matrix @ matrix.T - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(matrix) <= 0:
         raise SceneError(f"{place} is no rotation")
     u, _, v = np.linalg.svd(matrix)
     nearest: NDArray[np.float64] = u @ v

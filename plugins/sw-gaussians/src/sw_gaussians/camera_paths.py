@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 SPIRAL_TURNS = 2
-"""Turns of a spiral; it moves forth and back once meanwhile, so that its last frame leads to its first."""
+"""Turns of a spiral, during which it moves forward and back once, so that the video loops."""
 NEARLY_PARALLEL = 1e-3
 """Mean squared sine of the angles between viewing directions below which they count as parallel (2 degrees)."""
 
@@ -124,7 +124,7 @@ def around(means: torch.Tensor, opacities: torch.Tensor, count: int, size: tuple
 
 
 def focus_of(cameras: Sequence[Camera], depth: float) -> Array:
-    """The point [3] nearest to all viewing axes; where these are parallel, the one `depth` before the mean camera."""
+    """Return the point [3] nearest to all viewing axes; if parallel, `depth` in front of the mean camera."""
     centers, rotations = _poses(cameras)
     forward = rotations[:, 2]
     point = nearest_to_axes(centers, forward)
@@ -145,7 +145,7 @@ def nearest_to_axes(centers: Array, forwards: Array) -> Array | None:
 
 
 def seen_depths(model: SplatModel, cameras: Sequence[Camera], rasterizer: Rasterizer) -> tuple[float, float]:
-    """The 5th and the 95th percentile of z of the Gaussians in the pictures of some of the cameras, world units.
+    """Return the 5th and 95th percentile of camera depth over visible Gaussians, world units, from a few cameras.
 
     Only those of opacity 0.1 and more count. Raises SceneError if none is in any picture.
     """
@@ -173,7 +173,7 @@ def _poses(cameras: Sequence[Camera]) -> tuple[Array, Array]:
 
 
 def _order(centers: Array) -> NDArray[np.intp]:
-    """Indices of the cameras in the order of the path."""
+    """Return camera indices in path order."""
     given = np.arange(len(centers))
     left, path = np.ones(len(centers), dtype=bool), [0]
     left[0] = False
@@ -204,7 +204,7 @@ def _camera(cameras: Sequence[Camera], eye: Array, rotation: Array, size: tuple[
 
 
 def _weighted(values: Array, weights: Array, share: float) -> float:
-    """The value below which a share of the weights lies."""
+    """Return the weighted quantile."""
     order = np.argsort(values)
     total = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(total, share * total[-1])])

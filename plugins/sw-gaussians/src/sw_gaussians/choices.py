@@ -1,8 +1,8 @@
-"""The parts of a method that a user may exchange: a codec or a pruner, by name, with the settings of who provides it.
+"""Exchangeable parts of a method: a codec or a pruner chosen by name, with the settings of its package.
 
 A config asks for one with a block, `codec: CodecChoice` or one of its own that extends `PrunerChoice`, and is itself a
-`Choosing`. Then `--set codec=NAME` and `--set codec.settings.KEY=VALUE` work, for a stranger's codec too: keys, types
-and bounds are those of `Settings`, the pydantic model of the class that is registered under that name.
+`Choosing`. Then `--set codec=NAME` and `--set codec.settings.KEY=VALUE` work, also for third-party codecs. Keys,
+types and bounds come from `Settings`, the pydantic model of the class registered under that name.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ ChoiceT = TypeVar("ChoiceT", bound="Choice")
 
 
 class Choice(Named):
-    """Provider of a kind, by name, and its settings: a subclass has a field for the name and `settings`, a dict.
+    """Base of blocks that choose a registered class: a field for its name, and `settings`, a dict.
 
     REGISTRY    attribute of the plugin manager that knows the names
     PARTS       further fields with settings, each for a part of the work alone; they win over `settings`
@@ -107,14 +107,14 @@ class Choice(Named):
         return {f"{path}.settings.{name}": field.description or "" for name, field in fields.items()}
 
     def normal(self: ChoiceT, plugins: PluginManager) -> ChoiceT:
-        """Return this with those settings alone that differ from the provider's defaults."""
+        """Return this with only the settings that differ from the provider's defaults."""
         model = self._model(plugins, self.NAME)
         settings = {} if model is None else given_values(model.model_validate(self.model_dump()["settings"]), plugins)
         return super().normal(plugins).model_copy(update={"settings": settings})
 
 
 class CodecChoice(Choice):
-    """Codec of whole Gaussian models; the default of `name` is the method's to say."""
+    """Codec of whole Gaussian models; each method sets the default of `name`."""
 
     REGISTRY: ClassVar[str] = "gaussian_codecs"
 
@@ -128,7 +128,7 @@ class CodecChoice(Choice):
 
 
 class PrunerChoice(Choice):
-    """Pruner; a block of a method extends it by when and how much it removes."""
+    """Pruner; a method's subclass adds when and how much it removes."""
 
     REGISTRY: ClassVar[str] = "pruners"
     NAME: ClassVar[str] = "pruner"

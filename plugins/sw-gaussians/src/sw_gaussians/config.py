@@ -28,7 +28,7 @@ class LearningRates(Params):
 
 
 class Fast(Params):
-    """Parts of fast training, each off by default; the preset `fast` of 3dgs turns on what pays."""
+    """Optional speed-ups of training, all off by default; preset `fast` of 3dgs enables those that pay."""
 
     rates: Annotated[Literal["given", "length"], SameResult()] = Field(
         "given", description="length: lr.position_final and lr.sh_rest, unless given, are raised by how short a run is"
@@ -45,7 +45,7 @@ class Fast(Params):
 
     @property
     def late(self) -> list[str]:
-        """The keys that are on and act after density control alone."""
+        """Enabled keys that act only after density control has ended."""
         return [f"fast.{key}" for key, off in (("late_views", 1), ("average", 0)) if getattr(self, key) != off]
 
 
@@ -75,7 +75,7 @@ class GaussianTraining(Exchangeable):
         return translated(super().translated(values), self.density)
 
     def completed(self, plugins: Any, sources: Mapping[str, str]) -> Any:
-        """Return this with the learning rates that follow from its length, where `fast.rates` asks for it."""
+        """Return this with learning rates scaled to the length of the run, if `fast.rates` is set."""
         asked = super().completed(plugins, sources)
         if self.fast.rates == "given":
             return asked

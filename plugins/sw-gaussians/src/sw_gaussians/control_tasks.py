@@ -1,4 +1,4 @@
-"""Lines of a density control's plan as schedule tasks."""
+"""Schedule tasks that call the actions of a density control."""
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ Action = Callable[..., Mapping[str, int] | None]
 
 
 class ControlTask:
-    """Does something with a density control, and records the curves that it reports.
+    """Calls an action of a density control and records the curves that it reports.
 
-    At the last step of a stage nothing happens: no update follows that could repair a picture. A full run ends long
-    after the last densification and opacity reset; a run that is cut short to a multiple of 100 would lose about 0.8 dB
-    (lego, 7,000 steps), one cut to a multiple of 3,000 almost everything. Published figures of short runs are taken
-    before the densification of their last step, too.
+    Does nothing at the last step of a stage, since no update follows. A full run ends long after the last densification
+    and opacity reset. But a run cut to a multiple of 100 steps would lose about 0.8 dB (lego, 7,000 steps), one cut to
+    a multiple of 3,000 almost everything. Published results of short runs are measured before that densification, too.
     """
 
     def __init__(self, do: Action) -> None:
@@ -31,14 +30,14 @@ class ControlTask:
 
 
 class Collect(ControlTask):
-    """Collects statistics of a drawing, which leaves the model and all gradients alone."""
+    """Collects statistics of a render; changes neither the model nor any gradient."""
 
     def __call__(self, state: TrainingState) -> None:
         self.do(state, state.result)
 
 
 class Adjust(ControlTask):
-    """Adjusts which primitives there are; its state in checkpoints is that of the control."""
+    """Adds and removes primitives; its checkpoint state is that of the control."""
 
     def __init__(self, do: Action, control: DensityControl) -> None:
         super().__init__(do)
@@ -52,7 +51,7 @@ class Adjust(ControlTask):
 
 
 class Change(ControlTask):
-    """Changes values of the primitives that there are, such as their opacities."""
+    """Changes values of existing primitives, such as their opacities."""
 
 
 def control_task(do: Action, control: DensityControl, adjust: Action) -> ControlTask:

@@ -1,4 +1,4 @@
-"""Covariances of Gaussians as arrays."""
+"""Covariances of Gaussians as numpy arrays or tensors."""
 
 from __future__ import annotations
 

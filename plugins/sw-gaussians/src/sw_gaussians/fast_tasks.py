@@ -1,6 +1,6 @@
-"""The schedule tasks of fast training, by name, for stages that have a plan of their own.
+"""Schedule tasks of fast training (budget densification, opacity halving, multi-view pruning).
 
-As those of `tasks`, they change nothing at the last step of a stage: no update follows that could repair it.
+Like `tasks`, they do nothing at the last step of a stage, since no update follows.
 """
 
 from typing import Literal
@@ -17,9 +17,9 @@ from splatwizard_core.api import (
     SplatOptimizer,
     TaskLog,
 )
-from sw_gaussians.blame import blame_of_views, draw_views, guilt
 from sw_gaussians.density import budget
 from sw_gaussians.density.budget import Score
+from sw_gaussians.multiview_pruning import draw_views, multiview_error_scores, normalized_scores
 
 
 class DensifyToBudget:
@@ -79,7 +79,7 @@ class DensifyToBudget:
 
 
 class HalveOpacity:
-    """Halves every opacity, down to `floor`, and lets Adam start afresh (sw_gaussians.density.budget.halve_opacity)."""
+    """Halves every opacity, down to `floor`, and resets Adam's state (sw_gaussians.density.budget.halve_opacity)."""
 
     def __init__(self, *, floor: float = budget.OPACITY_FLOOR) -> None:
         self.floor = floor
@@ -90,11 +90,11 @@ class HalveOpacity:
 
 
 class PruneByViews:
-    """Removes Gaussians that are faint, or that several views blame for their badly drawn pixels.
+    """Removes Gaussians that are nearly transparent, or that cover badly rendered pixels in several views.
 
     views           training views that are drawn each time
     min_opacity     fainter Gaussians go
-    most            those whose share of the blame exceeds this go, 0..1 (`blame.guilt`)
+    most            prune Gaussians whose score exceeds this, 0..1 (`multiview_pruning.normalized_scores`)
     lambda_dssim, padding   of the photometric loss that a view's pixels are weighted with
 
     Views are drawn as the training draws them, but on the scene's background even where that of a step is random.
@@ -131,11 +131,11 @@ class PruneByViews:
             return
         with torch.no_grad():
             views = draw_views(scene.train, self.views, model.next_split_generator())
-            blame = blame_of_views(
+            blame = multiview_error_scores(
                 model, views, rasterizer, scene.background.to(model.device), clamp=ppl.clamp_render,
                 lambda_dssim=self.lambda_dssim, padding=self.padding,
             )  # fmt: skip
-            stays = (model.opacities >= self.min_opacity) & (guilt(blame) <= self.most)
+            stays = (model.opacities >= self.min_opacity) & (normalized_scores(blame) <= self.most)
             left, before = int(stays.sum()), model.num_rows
             if left == 0:
                 raise EmptyModel(step)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 def mean_squared_neighbor_distance(points: Tensor, neighbors: int = 3) -> Tensor:
-    """Mean of the squared distances to the nearest *other* points, [N] float32 on the device of `points`.
+    """Return the mean squared distance to the nearest *other* points, [N] float32 on the device of `points`.
 
     points      [N,3], finite
     neighbors   how many; with fewer other points those there are, with none 0. A duplicate counts, at distance 0
@@ -30,7 +30,7 @@ def mean_squared_neighbor_distance(points: Tensor, neighbors: int = 3) -> Tensor
 
 
 def nearest_neighbors(points: Tensor, neighbors: int) -> Tensor:
-    """Indices of the nearest points, the point itself first (or a duplicate of it), [N,k] int32 on the same device.
+    """Return indices of the nearest points, [N,k] int32, same device, the point itself (or a duplicate) first.
 
     points      [N,3], finite
     neighbors   k, the point itself included; fewer where there are fewer points

@@ -1,19 +1,19 @@
-"""Updates on the summed gradients of several views, for the end of a training: less noise, and less work for Adam."""
+"""Gradient accumulation over several views at the end of a training: less noise, fewer Adam updates."""
 
 from splatwizard_core.api import SplatModel, SplatOptimizer
 
 PENDING = "pending"
-"""Key of a parameter's state: the sum of the gradients since its last update, of the parameter's shape."""
-AFTER_ALL = 100
+"""Key in the optimizer state: gradient sum since the last update, same shape as the parameter."""
+LAST_PRIORITY = 100
 """Priority behind all tasks that read or change gradients."""
 
 
 class SumViews:
-    """Adds gradients up, and lets dense Adam update with their sum at every `views`-th step, from step `first` on.
+    """Accumulates gradients and updates with their sum every `views` steps, from step `first` on; dense Adam only.
 
     last    step that updates with what there is by then, be it fewer views; None: what is left is lost
 
-    A post task, to be registered with priority `AFTER_ALL`. The sums are part of the optimizer's state: they follow
+    A post task, to be registered with priority `LAST_PRIORITY`. The sums are part of the optimizer's state: they follow
     rows that come, go or are put in another order, and are in checkpoints. Adam does not see the factor between a sum
     and a mean, so learning rates stay as they are.
     Source: FastGS (arXiv 2511.04283). Raises ValueError for less than one view.
@@ -25,7 +25,7 @@ class SumViews:
         self.views, self.first, self.last = views, first, last
 
     def waits(self, step: int) -> bool:
-        """Return whether a step only adds its gradients."""
+        """Return whether a step only accumulates, without an update."""
         return step >= self.first and step != self.last and (step - self.first + 1) % self.views != 0
 
     def __call__(self, model: SplatModel, optimizer: SplatOptimizer, step: int) -> None:

@@ -1,7 +1,7 @@
-"""Density control of 3DGS-MCMC as schedule tasks, for this method and, by name, for others.
+"""Schedule tasks of 3DGS-MCMC density control, registered by name for any method.
 
-Every draw comes from a stream that is named after the step, so there is no state to save: a run that resumes at a step
-draws what the uninterrupted one drew there. At the last step nothing is moved: no update follows that could repair it.
+Random numbers come from a stream per step, so there is no generator state to save: a resumed run draws the same
+numbers. Relocation does nothing at the last step, since no update follows.
 """
 
 from splatwizard_core.api import GaussianModel, OptimizationParams, SplatOptimizer, TaskLog, stream
@@ -43,10 +43,10 @@ class Grow:
 
 
 class AddNoise:
-    """Shakes the means after each update (sw_gaussians.density.mcmc.add_noise).
+    """Adds noise to the means after each update (sw_gaussians.density.mcmc.add_noise).
 
-    A pre task: what follows the update of step s - 1 happens at the start of step s, and before the task that sets the
-    step size, so that it is still that of s - 1. Register it before "update lr".
+    A pre task: it runs at the start of step s, after the update of step s - 1. Register it before "update lr", so that
+    the learning rate is still that of step s - 1.
     """
 
     def __init__(self, *, strength: float = 5e5, min_opacity: float = 0.005) -> None:

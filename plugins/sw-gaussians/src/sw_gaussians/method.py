@@ -1,4 +1,4 @@
-"""Methods whose result is a set of Gaussians, and whose file any codec of Gaussians may write."""
+"""Base class of methods that produce explicit Gaussians and let a chosen codec write the file."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ HEADER_KEY = "codec"
 
 
 class GaussianMethod(Method):
-    """Base of methods that leave it to a codec how their Gaussians are written, as those do that only prune.
+    """Base of methods, such as pruning methods, whose Gaussians are written by an exchangeable codec.
 
     A subclass says in `stages` how it trains; its Config is a `Choosing` with a block `codec`, a `CodecChoice`. It
     starts from a trained scene where its first stage does, else from the scene's points; one that starts otherwise
@@ -34,7 +34,7 @@ class GaussianMethod(Method):
     """
 
     def __init__(self, plugins: PluginManager, config: OptimizationParams | None) -> None:
-        """Raise ConfigError for a codec or a part of it that is not installed: now, and not when all is trained."""
+        """Raise ConfigError for a missing codec (or part of one) now, before training."""
         super().__init__(plugins, config)
         if config is None:
             return
@@ -69,7 +69,7 @@ class GaussianMethod(Method):
         self.config.codec.load(self.plugins).encode(model, writer)
 
     def decode(self, reader: ContainerReader) -> SplatModel:
-        """Return the model, by whichever codec has written it. Raises BitstreamError."""
+        """Decode the model with the codec that the header names. Raises BitstreamError."""
         self.check_version(reader)
         model = self.plugins.gaussian_codecs.load(self.codec_of(reader))(self.plugins).decode(reader)
         if isinstance(model, SurfelModel):

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 BITS = 21
-"""Bits an axis: three of them fill an int64."""
+"""Bits per axis; three axes fill an int64."""
 _SPREAD = (
     (32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3),
     (2, 0x1249249249249249),

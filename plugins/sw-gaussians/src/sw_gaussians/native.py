@@ -1,4 +1,4 @@
-"""The native module of training Gaussians: sparse Adam, and on CUDA statistics and normals."""
+"""Native module of this package: sparse Adam; on CUDA also gradient statistics and normals."""
 
 from __future__ import annotations
 

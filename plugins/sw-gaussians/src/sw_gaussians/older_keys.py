@@ -1,4 +1,4 @@
-"""Keys of configurations until 0.2, when all density controls stood in one: as they are read today."""
+"""Translation of configuration keys up to 0.2, when all density controls shared one block."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ DENSIFY: Mapping[str, Moved] = {
     **_settings("densify", _ADAPTIVE, "adc"),
     "densify.pause_after_reset": Moved((), 0),
 }
-"""Keys of the block `densify`, which others than 3DGS had, too."""
+"""Keys of the old block `densify`, which several methods had."""
 
 OLDER: Mapping[str, Moved] = {
     **DENSIFY,
@@ -49,7 +49,7 @@ OLDER: Mapping[str, Moved] = {
 
 
 def translated(values: dict[str, Any], density: DensityChoice) -> dict[str, Any]:
-    """Return values by dotted key with the name of the control that older keys mean.
+    """Return values by dotted key, with the density control's name added that the older keys imply.
 
     density     as it stands without these values
 
@@ -85,7 +85,7 @@ def translated(values: dict[str, Any], density: DensityChoice) -> dict[str, Any]
 
 
 def within(values: Mapping[str, Any], prefix: str) -> dict[str, Any]:
-    """Return values by dotted key with today's keys of density control in a block of another method's values.
+    """Return values by dotted key, translating density-control keys in a nested block of another method.
 
     prefix  of the block, such as "base."; a table that stands there whole is flattened, a name alone gets its key
     """

@@ -1,4 +1,4 @@
-"""Smooth curves through camera poses: cubic in the positions and in the quaternions, at an even pace."""
+"""Smooth curves through camera poses: cubic in positions and quaternions, at constant speed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sizes of the training pictures over time, as keys of any method that trains from points."""
+"""Configuration keys of the training-image resolution schedule."""
 
 from __future__ import annotations
 

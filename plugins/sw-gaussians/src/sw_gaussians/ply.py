@@ -1,6 +1,6 @@
-"""The .ply of 3DGS: 62 float32 a Gaussian at SH degree 3, raw values, as the authors' code and all viewers read it.
+"""The .ply of 3DGS: 62 float32 per Gaussian at SH degree 3, raw values, as the authors' code and viewers read it.
 
-That of 2DGS differs in one thing: a surfel has no `scale_2`. Which of the two a file is, that property says.
+A .ply of 2DGS has no `scale_2`; that property tells the two apart.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from splatwizard_core.api import (
     replacing,
     world_shift,
 )
-from sw_gaussians.drawn_as import antialias_of, lost_options
-from sw_gaussians.mapped import mapped
+from sw_gaussians.memory_map import memory_map
 from sw_gaussians.ply_gaussians import MIP_COMMENT, ORIGIN_COMMENT, WORLD_COMMENT, file_parts, parse_gaussians
+from sw_gaussians.render_options import antialias_of, lost_options
 from sw_gaussians.surfels import as_ellipsoids, gaussians_of
 
 log = logging.getLogger(__name__)
@@ -40,7 +40,7 @@ def load_ply(path: str | os.PathLike[str]) -> GaussianModel:
     Any order of properties, any type of number, binary or ASCII, is read; normals and unknown properties are ignored.
     Raises BitstreamError if the file is damaged, SceneError if it cannot be read or is not a 3DGS model.
     """
-    return from_ply(mapped(path), os.fspath(path))
+    return from_ply(memory_map(path), os.fspath(path))
 
 
 def from_ply(data: bytes | memoryview, path: str) -> GaussianModel:
@@ -91,7 +91,7 @@ def export_ply(model: SplatModel, path: str | os.PathLike[str]) -> None:
 
 
 def export_ply_as_3dgs(model: SplatModel, path: str | os.PathLike[str]) -> None:
-    """Do what `export_ply` does, with a third scale of 1e-8 for surfels, so that viewers of 3DGS show them.
+    """Write as `export_ply`, but give surfels a third scale of 1e-8, so that 3DGS viewers show them.
 
     What these show is not what a rasterizer of surfels draws: they widen every Gaussian by their low-pass filter.
     """
@@ -99,7 +99,7 @@ def export_ply_as_3dgs(model: SplatModel, path: str | os.PathLike[str]) -> None:
 
 
 def to_ply(model: GaussianModel) -> bytes:
-    """The bytes that `export_ply` writes of a model, with no comment."""
+    """Return the bytes that `export_ply` writes, without comments."""
     return b"".join(_parts_of(model))
 
 

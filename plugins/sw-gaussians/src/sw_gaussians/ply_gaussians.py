@@ -1,4 +1,4 @@
-"""Gaussians in a .ply, whoever wrote it: which properties a dialect has, and what each of them means.
+"""Reader and writer of Gaussian .ply files in the dialects of public trainers.
 
 Sources: 3D Gaussian Splatting (arXiv 2308.04079) for the layout, Mip-Splatting (arXiv 2311.16493) for `filter_3D`, and
 the comments that public trainers write.
@@ -22,18 +22,18 @@ from sw_gaussians.ply_tables import MAX_HEADER, PlyHeader, Table, read_header, r
 Array = npt.NDArray[np.float32]
 
 MIP_COMMENT = "SplatRenderMode: mip"
-"""Says that a file was trained with the filter of Mip-Splatting."""
+"""Comment of files trained with the Mip-Splatting filter."""
 ORIGIN_COMMENT, WORLD_COMMENT = "world_origin", "world_coordinates"
-"""Words of comments with three numbers: where the origin of the coordinates lies in the world of the scene; of the
-second the coordinates are those of the world, and the numbers say about which origin they can be held in float32."""
-FAR_OUT = 1e4
-"""Distance from 0, in sizes of the model, from which coordinates in doubles are kept about an origin of their own."""
+"""Keywords of comments with three numbers. First: world position of the coordinate origin. Second: coordinates are
+world coordinates, and the numbers are a suggested local origin for float32."""
+MAX_OFFSET_RATIO = 1e4
+"""Distance from 0, in model sizes, beyond which float64 coordinates get a local origin."""
 _ROWS_AT_ONCE = 1 << 13  # 2 MB of rows: they stay in the processor's cache
 
 
 @dataclass
 class PlyGaussians:
-    """Raw values of a file; rows as in the file.
+    """Raw values of a file, rows in file order.
 
     means           [N,3] float32
     sh_dc           [N,3]
@@ -132,7 +132,7 @@ def _means(vertex: Table, comments: Sequence[str], notes: list[str]) -> tuple[Ar
     if origin is None and told[ORIGIN_COMMENT] is None and doubles and len(vertex):
         middle = [float(np.median(vertex[axis])) for axis in "xyz"]
         size = max(float(np.median(np.abs(vertex[axis] - at))) for axis, at in zip("xyz", middle, strict=True))
-        if math.isfinite(sum(middle)) and math.hypot(*middle) > FAR_OUT * max(size, 1e-9):
+        if math.isfinite(sum(middle)) and math.hypot(*middle) > MAX_OFFSET_RATIO * max(size, 1e-9):
             origin = (round(middle[0]), round(middle[1]), round(middle[2]))
             notes.append(f"its coordinates lie far from 0 and are moved to a local origin at {origin}")
     if origin is None:
@@ -207,7 +207,7 @@ def _bake(log_scales: Array, logits: Array, filters: Array) -> tuple[Array, Arra
 
 
 def _render_mode(comments: Sequence[str]) -> str:
-    """The last word of the comments on how the file was trained: default, mip or 2dgs; "" where they are silent."""
+    """Return the training mode from the file's comments: default, mip or 2dgs; "" if not stated."""
     mode = ""
     for comment in comments:
         words = comment.lower().replace(":", " ").split()
@@ -235,7 +235,7 @@ def _columns(vertex: Table, names: Sequence[str]) -> Array:
 
 
 def _contiguous(view: Array) -> Array:
-    """A copy in one piece, made by two threads."""
+    """Return a contiguous copy, made by two threads."""
     out = np.empty(view.shape, np.float32)
     _by_threads(lambda rows: np.copyto(out[rows], view[rows]), len(view))
     return out

@@ -1,4 +1,4 @@
-"""Elements of a .ply file as tables: the header checked against the size of the file before anything is allocated.
+"""Parser of .ply elements into tables; checks the header against the file size before allocating.
 
 Rows of fixed width are viewed where they lie; text, and what stands behind elements with lists, is read by plyfile.
 """
@@ -18,7 +18,7 @@ from splatwizard_core.api import BitstreamError
 
 MAX_HEADER = 1 << 17
 MAX_LIST_ROWS = 1 << 20
-"""Rows of elements with lists, which are walked one by one."""
+"""Largest number of rows with lists, which are parsed one by one."""
 _TYPES = {
     "char": "i1", "uchar": "u1", "int8": "i1", "uint8": "u1", "short": "i2", "ushort": "u2", "int16": "i2",
     "uint16": "u2", "int": "i4", "uint": "u4", "int32": "i4", "uint32": "u4", "float": "f4", "float32": "f4",
@@ -39,7 +39,7 @@ class _Element:
     names: set[str] = field(default_factory=set)  # of the fields, to look one up
 
     def least_bytes(self, binary: bool) -> int:
-        """Bytes that the rows take at least: a list its length, a value of text two letters, an empty row one."""
+        """Return the least number of bytes of the rows: per list its length, per text value 2, per empty row 1."""
         width = sum(int(code[1]) for _, code in self.fields) if binary else 2 * len(self.fields)
         return self.count * max(width + self.lists * (1 if binary else 2), 1)
 
@@ -73,7 +73,7 @@ class PlyHeader:
 
 
 def read_header(head: bytes, size: int, name: str) -> PlyHeader:
-    """Parse the header, and hold the file to have the rows that it claims.
+    """Parse the header, and check that the file is long enough for its rows.
 
     head    the first MAX_HEADER bytes of the file (fewer if it is shorter)
     size    bytes of the file

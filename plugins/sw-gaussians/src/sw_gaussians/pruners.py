@@ -1,4 +1,4 @@
-"""The plainest pruner, which the others are compared with."""
+"""Pruner by opacity, the baseline of all others."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ if TYPE_CHECKING:
 
 
 class Opacity:
-    """Keeps what is opaque; looks at no view."""
+    """Scores each Gaussian by its opacity; needs no view."""
 
     uses_statistics = False
 
     def score(
         self, model: SplatModel, cameras: Sequence[Camera], rasterizer: Rasterizer, background: Tensor | None = None
     ) -> Tensor:
-        """[N] opacities, 0..1. Raises TypeError for a model without opacities of its own."""
+        """Return opacities [N], 0..1. Raises TypeError for a model without opacities."""
         if not isinstance(model, GaussianModel):
             raise TypeError(f"the pruner 'opacity' scores a GaussianModel, not a {type(model).__name__}")
         return model.opacities.detach()

@@ -1,4 +1,4 @@
-"""The preset `quick` of methods that train Gaussians from points: the plan scaled down for a CPU and the demo scene."""
+"""Preset `quick` of methods that train from points: a short schedule for a CPU and the demo scene."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ QUICK: Mapping[str, Any] = {
     "density.settings.stop": 1200,
     "density.settings.grad_threshold": 4e-4,
 }
-"""No opacity reset, and larger steps, since there are few.
+"""No opacity reset; larger learning rates, since there are few steps.
 
 3DGS reaches 34.3 dB with it on `demo` with 25,000 Gaussians, against 31.6 dB at the paper's learning rates
 (2,000 and 1,500 steps).

@@ -1,6 +1,6 @@
-"""A resolution schedule: training begins with small pictures, which cost less and hold what is learned first.
+"""Resolution schedule: training starts with small images and ends at full resolution.
 
-Source: DashGaussian (arXiv 2503.18402); `s` is how many times smaller the side of a picture is.
+Source: DashGaussian (arXiv 2503.18402); `s` is the factor by which the side of an image is reduced.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from splatwizard_core.api import Scene
 
 LEVELS = 32
-"""Steps of spectral content between the first and the full resolution."""
-HALVINGS = 24
-"""Of the interval in which a scale is searched: finer than a pixel of any picture."""
-ENERGY = 4.0
-"""The first pictures hold one part in so many of the sum of all amplitudes."""
+"""Number of resolution levels between the first and the full resolution."""
+BISECTION_STEPS = 24
+"""Bisection steps of the search for a scale: finer than a pixel of any image."""
+FIRST_ENERGY_DIVISOR = 4.0
+"""The first images hold 1/FIRST_ENERGY_DIVISOR of the sum of all spectral amplitudes."""
 
 Rounding = Literal["real", "floor"]
 
@@ -35,7 +35,7 @@ def amplitudes(picture: Tensor) -> Tensor:
 
 
 class Spectrum:
-    """Sums of amplitudes [H,W] in windows around their middle, each found at once."""
+    """Summed-area table of amplitudes [H,W]: sums over centred windows in constant time."""
 
     def __init__(self, amplitude: Tensor) -> None:
         self.height, self.width = amplitude.shape
@@ -54,7 +54,7 @@ class Spectrum:
     def scale_of(self, energy: float) -> float:
         """Return the largest scale >= 1 whose window holds at least this sum."""
         low, high = 0.0, 1.0  # of 1 / scale
-        for _ in range(HALVINGS):
+        for _ in range(BISECTION_STEPS):
             middle = (low + high) / 2
             if middle > 0 and self.within(1 / middle) < energy:
                 low = middle
@@ -65,7 +65,7 @@ class Spectrum:
 
 @dataclass(frozen=True)
 class ResolutionPlan:
-    """Scales over time: at step `times[k]` the pictures are `scales[k]` times smaller; in between, and 1 at the end.
+    """Scales over time: at step `times[k]` images are `scales[k]` times smaller, interpolated in between, 1 at the end.
 
     times   ascending, the first one 0, the last one the step from which pictures are whole
     scales  descending, the last one 1
@@ -86,11 +86,11 @@ class ResolutionPlan:
 
 def first_scale(spectrum: Spectrum) -> float:
     """Return the scale at which one picture holds its first share of the amplitudes."""
-    return spectrum.scale_of(spectrum.within(1) / ENERGY)
+    return spectrum.scale_of(spectrum.within(1) / FIRST_ENERGY_DIVISOR)
 
 
 def resolution_plan(first: float, mean: Spectrum, *, full_at: int) -> ResolutionPlan:
-    """Return when pictures have which scale, by what their spectra hold.
+    """Return the resolution plan computed from the spectra of the images.
 
     first       scale of the first pictures; without detail beyond it, or at 1, pictures are whole from the start
     mean        spectrum of the mean of their amplitudes
@@ -140,14 +140,14 @@ def shrunk(image: Tensor, height: int, width: int) -> Tensor:
 
 
 class SmallerView(View):
-    """A view as it looks at a lower resolution; the field of view stays."""
+    """A view at a lower resolution; the field of view is unchanged."""
 
     def __init__(self, view: View, width: int, height: int) -> None:
         super().__init__(view.camera.resized(width, height), view.name)
         self.whole = view
 
     def image(self, background: Tensor | None = None, device: torch.device | str = "cpu") -> Tensor:
-        """float32 [3,h,w] in 0..1 on `device`, made of the whole picture each time."""
+        """Return float32 [3,h,w] in 0..1 on `device`, downsampled from the full image per call."""
         return shrunk(self.whole.image(background, device), self.camera.height, self.camera.width)
 
 

@@ -1,4 +1,4 @@
-"""Adam of the rows that a view shows."""
+"""Sparse Adam: updates only the rows (Gaussians) visible in the current view."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def sparse_adam(
 
 @torch.no_grad()
 def sparse_adam_steps(updates: Sequence[AdamUpdate], rows: Tensor) -> None:
-    """Update the marked rows [N] bool of many parameters [N, ...] as `sparse_adam` does; no `step` is looked at."""
+    """Update the marked rows [N] bool of many parameters [N, ...] as `sparse_adam` does; ignores `step`."""
     for update in updates:
         _check(update, rows)
     for update in fast.left_of(updates, rows):
@@ -78,7 +78,7 @@ def _check(u: AdamUpdate, rows: Tensor) -> None:
 
 
 class SparseSplatOptimizer(SplatOptimizer):
-    """Adam that updates only the Gaussians that the view shows; parameters without rows (networks) as always."""
+    """Adam that updates only the Gaussians visible in the view; parameters without rows (networks) densely."""
 
     def step(self, result: RenderResult | None = None) -> None:
         self.step_rows(None if result is None else result.visible)

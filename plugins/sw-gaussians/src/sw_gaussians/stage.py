@@ -1,4 +1,4 @@
-"""The training stage of 3DGS: the one that other methods start from, extend, or take over whole."""
+"""The training stage of 3DGS, which other methods extend or wrap."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from splatwizard_core.api import (
     StageContext,
     photometric_loss,
 )
+from sw_gaussians.adam_moments import keep_moments
 from sw_gaussians.averaging import average_of_the_end
 from sw_gaussians.control_tasks import control_task
 from sw_gaussians.fast.fused_adam import FusingOptimizer, offer_updates
-from sw_gaussians.late_batches import AFTER_ALL, SumViews
+from sw_gaussians.late_batches import LAST_PRIORITY, SumViews
 from sw_gaussians.learning_rate import exponential_lr
-from sw_gaussians.moments import keep_moments
 from sw_gaussians.sparse_adam import SparseSplatOptimizer
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ class UpdateLearningRate:
 
 
 def increase_sh_degree(model: GaussianModel) -> None:
-    """Draw and train one more band of spherical harmonics, up to the model's own degree."""
+    """Activate one more SH band, up to the model's maximum degree."""
     model.active_sh_degree = min(model.active_sh_degree + 1, model.max_sh_degree)
 
 
@@ -86,7 +86,7 @@ class ThreeDGSStage(Stage):
 
     control         what adds and removes Gaussians: `config.density.load(plugins)`; None: adaptive density control
     fuses_updates   on CUDA spherical harmonics are updated in the backward pass, at steps at which nothing else asks
-                    for their gradients; with dense Adam alone. None: from `fused_adam.FUSED_FROM` Gaussians on
+                    for their gradients; with dense Adam alone. None: from `fused_adam.MIN_FUSED_GAUSSIANS` Gaussians on
     """
 
     name = "3dgs"
@@ -139,7 +139,7 @@ class ThreeDGSStage(Stage):
 
     @functools.cached_property
     def settled(self) -> int:
-        """Step of this run at which density control ends."""
+        """Last step of this run with density control."""
         return self.steps(self.control.until)
 
     def begin(self, context: StageContext) -> SplatModel:
@@ -173,7 +173,7 @@ class ThreeDGSStage(Stage):
         return self._optimizer
 
     def finish(self, model: SplatModel, scene: Scene) -> SplatModel:
-        """Return the model, with Adam's moments beside it for whoever goes on from here."""
+        """Return the model, with Adam's moments attached for a following stage."""
         if self._optimizer is not None and self._optimizer.model is model:
             keep_moments(model, self._optimizer)
         self._optimizer = None
@@ -204,7 +204,7 @@ class ThreeDGSStage(Stage):
         if self.config.fast.late_views > 1:
             sums = SumViews(views=self.config.fast.late_views, first=self.settled, last=self.iterations - 1)
             steps = range(self.settled, self.iterations + 1)
-            scheduler.register_task(steps, sums, priority=AFTER_ALL, name="sum views")
+            scheduler.register_task(steps, sums, priority=LAST_PRIORITY, name="sum views")
 
     def _register(self, scheduler: Scheduler, tasks: Iterable[DensityTask], *, every: range) -> None:
         for name, when, do in tasks:
@@ -212,7 +212,7 @@ class ThreeDGSStage(Stage):
             scheduler.register_task(every if when is None else self.when(when), task, name=name)
 
     def adjust(self, state: TrainingState) -> DensityReport:
-        """Let the control add and remove Gaussians; a stage with rules of its own does more."""
+        """Let the density control add and remove Gaussians; subclasses may add rules."""
         return self.control.adjust(state)
 
     def raster_options(self, step: int, background: Tensor) -> RasterOptions:

@@ -1,4 +1,4 @@
-"""The first Gaussians of a scene: one for each of its start points."""
+"""Initialisation: one Gaussian (or surfel) per start point."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def start_points(scene: Scene, who: str, *, instead: str = "") -> PointCloud:
 def gaussians_from_points(
     points: PointCloud, *, max_sh_degree: int = 3, opacity: float = 0.1, scale_factor: float = 1.0
 ) -> GaussianModel:
-    """Make one isotropic Gaussian for each point, as large as the distance to its three nearest neighbours.
+    """Make one isotropic Gaussian per point, sigma = RMS distance to its three nearest neighbours.
 
     points          xyz [P,3]; points that are not finite are dropped with a warning; missing colours are grey
     opacity         initial opacity, 0..1
@@ -75,7 +75,7 @@ def surfels_from_points(
     scale_factor: float = 1.0,
     rotation: Rotation = "uniform4",
 ) -> SurfelModel:
-    """Make one round surfel for each point, as large as the distance to its three nearest neighbours.
+    """Make one round surfel per point, sigma = RMS distance to its three nearest neighbours.
 
     points      xyz [P,3]; points that are not finite are dropped with a warning; missing colours are grey
     generator   of the rotations, on the CPU

@@ -1,6 +1,6 @@
-"""The surface that a picture of depths shows: its depth, its normals, and the normals that were drawn.
+"""Depth and normals of a surface from rendered depth maps, and rendered normals in world space.
 
-Functions on the maps of a `RenderResult`, for losses in training and for what reads the geometry afterwards.
+Functions on the maps of a `RenderResult`, for training losses and for mesh extraction.
 Source: 2D Gaussian Splatting (arXiv 2403.17888), section 5.1 and supplementary material.
 """
 

@@ -1,4 +1,4 @@
-"""Losses that draw surfels together into one surface: distortion, and normals that agree with the depth map.
+"""Surface losses of 2DGS: depth distortion and normal consistency.
 
 Source: 2D Gaussian Splatting (arXiv 2403.17888), section 5.
 """
@@ -20,7 +20,7 @@ NormalTerm = Literal["code", "paper"]
 
 
 def maps_for(*, distortion: bool, normals: bool, depth_ratio: float) -> dict[str, Any]:
-    """Return the fields of RasterOptions whose maps the losses of this module read.
+    """Return the fields of RasterOptions that request the maps these losses need.
 
     distortion, normals     which of the two losses has a weight
     depth_ratio             0..1, see `surface_depth`: only the depths that it blends are drawn
@@ -32,7 +32,7 @@ def maps_for(*, distortion: bool, normals: bool, depth_ratio: float) -> dict[str
 
 
 def distortion_loss(result: RenderResult) -> Tensor:
-    """Return the mean over all pixels of the distortion: pairs of surfels on a ray should be near or faint; scalar.
+    """Return the mean depth distortion over all pixels, a scalar: penalises surfels spread along a ray.
 
     The map is not scale invariant (depths are compared between z = 0.2 and 100 world units), so neither is a weight.
     Raises ValueError if the distortion was not drawn.
@@ -43,7 +43,7 @@ def distortion_loss(result: RenderResult) -> Tensor:
 
 
 def normal_disagreement(result: RenderResult, camera: Camera, depth_ratio: float, term: NormalTerm = "code") -> Tensor:
-    """Return [1,H,W], how far drawn normals are from those of the depth map, 0 .. 2.
+    """Return [1,H,W], the disagreement of rendered normals and depth-map normals, 0 .. 2.
 
     n is the sum of the weighted normals of the surfels, n_surf that of the depth map, A the opacity of the pixel:
 
@@ -94,7 +94,7 @@ def add_surface_losses(
     term: NormalTerm = "code",
     mask: Tensor | None = None,
 ) -> LossPack:
-    """Return `loss` with the weighted losses of the surface, which stand unweighted among its parts.
+    """Return `loss` plus the weighted surface losses; `parts` gets the unweighted values.
 
     distortion, normals     weights; a loss of weight 0 is neither computed nor named
     term                    form of the normal loss

@@ -1,4 +1,4 @@
-"""Flat Gaussians (surfels): the model of 2DGS and of what is trained on from it.
+"""Flat Gaussians (surfels): the model of 2DGS and of methods based on it.
 
 Source: 2D Gaussian Splatting (arXiv 2403.17888).
 """
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
     from splatwizard_core.api import ContainerReader, ContainerWriter
 
 PRIMITIVE, SURFEL = "primitive", "surfel"
-"""Header value of a file of surfels; that of other Gaussians does not have it."""
+"""Header key and value that mark a file of surfels; absent for other Gaussians."""
 
-THICKNESS = 1e-8
-"""Third scale of a surfel that is written as an ellipsoid, world units."""
+SURFEL_THICKNESS = 1e-8
+"""Third scale of a surfel converted to an ellipsoid, world units."""
 
 
 @dataclass(frozen=True)
 class Surface:
-    """The way in which the surface of a model was trained, and so is to be read.
+    """Settings with which a model's surface was trained; they decide how its depth is read.
 
     depth_ratio     r of `sw_gaussians.surface.surface_depth`, 0..1
     lambda_dist     weight of the distortion, >= 0
@@ -76,7 +76,7 @@ def gaussians_of(
 
 
 def refuse_surfels(model: GaussianModel, who: str) -> None:
-    """Raise UserInputError if `model` holds surfels, for whoever knows Gaussians with three scales only."""
+    """Raise UserInputError if `model` holds surfels; for code that needs three scales."""
     if model.NUM_SCALES == SurfelModel.NUM_SCALES:
         raise UserInputError(
             f"{who} takes Gaussians with three scales each, and these are surfels with two (2DGS); "
@@ -92,7 +92,7 @@ def as_ellipsoids(model: GaussianModel) -> GaussianModel:
     """
     if model.NUM_SCALES != SurfelModel.NUM_SCALES:
         return model
-    thickness = torch.full_like(model.opacity_logits, math.log(THICKNESS))
+    thickness = torch.full_like(model.opacity_logits, math.log(SURFEL_THICKNESS))
     flat = GaussianModel.from_tensors(
         model.means,
         model.sh_dc,
@@ -107,7 +107,7 @@ def as_ellipsoids(model: GaussianModel) -> GaussianModel:
 
 
 def state_surfels(model: GaussianModel, writer: ContainerWriter) -> None:
-    """Write into the header of a file that its Gaussians are surfels, where they are."""
+    """Mark the header of a file if its Gaussians are surfels."""
     if model.NUM_SCALES == SurfelModel.NUM_SCALES:
         writer.static[PRIMITIVE] = SURFEL
 

@@ -1,4 +1,4 @@
-"""The schedule tasks of 3DGS, by name, for stages that have a plan of their own.
+"""Schedule tasks of 3DGS, registered by name for stages with their own plan.
 
 Tasks without settings are plain functions; the others are made with their settings as keywords, so that a
 method of another package needs no class of ours: `plugins.tasks.load("prune-and-densify")(grad_threshold=4e-4)`.
@@ -59,7 +59,7 @@ class PruneAndDensify:
 
 
 class ResetOpacity:
-    """Lowers every opacity to at most `ceiling` and clears its Adam moments."""
+    """Clamps every opacity to at most `ceiling` and zeroes its Adam moments."""
 
     def __init__(self, *, ceiling: float = 0.01) -> None:
         self.ceiling = ceiling

@@ -1,4 +1,4 @@
-"""A learned mask that takes whole Gaussians out: it multiplies scales and opacity, and what it turns off is pruned.
+"""Learned binary mask per Gaussian that multiplies scales and opacity; masked Gaussians are pruned.
 
 Source: Compact 3D Gaussian Representation for Radiance Field (arXiv 2311.13681), section on the volume mask.
 """
@@ -15,7 +15,7 @@ from splatwizard_core.api import Camera, EmptyModel, GaussianInputs, GaussianMod
 
 
 class MaskQuantizer(Protocol):
-    """The quantizer `ste-mask`: 1 where the sigmoid is above its threshold, else 0; the gradient is the sigmoid's."""
+    """Quantizer `ste-mask`: 1 where the sigmoid exceeds the threshold, else 0, with the sigmoid's gradient."""
 
     def forward(self, x: Tensor) -> Tensor: ...
 
@@ -23,7 +23,7 @@ class MaskQuantizer(Protocol):
 
 
 class VolumeMaskedGaussians(GaussianModel):
-    """Gaussians with a mask M of 0 or 1 each: they are drawn with scales s M and opacity o M.
+    """Gaussians with a binary mask M each, rendered with scales s M and opacity o M.
 
     mask_logits [N]; clones and children of a split copy it
     quantizer   `ste-mask` of sw-codecs, with the threshold of the mask
@@ -64,7 +64,7 @@ class VolumeMaskedGaussians(GaussianModel):
 
 @torch.no_grad()
 def prune_by_mask(model: VolumeMaskedGaussians, rows: SplatOptimizer, *, step: int) -> int:
-    """Remove the Gaussians whose mask is off; how many that were. Raises EmptyModel if nothing would be left.
+    """Remove the Gaussians whose mask is 0; return how many. Raises EmptyModel if none would be left.
 
     All parameters with rows are new tensors afterwards, also where nothing goes: none is updated in this step.
     """
@@ -76,5 +76,5 @@ def prune_by_mask(model: VolumeMaskedGaussians, rows: SplatOptimizer, *, step: i
 
 
 def mask_prune(model: VolumeMaskedGaussians, optimizer: SplatOptimizer, step: int, log: TaskLog) -> None:
-    """Schedule task: remove the Gaussians whose mask is off; their number is the curve "masked"."""
+    """Schedule task: remove the Gaussians whose mask is 0; curve "masked"."""
     log.scalar("masked", prune_by_mask(model, optimizer, step=step))

@@ -1,4 +1,4 @@
-"""A stage around another stage: how a method takes over another one's training and changes a part of it."""
+"""Stage wrapper: reuse another method's training stage and override parts of it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from splatwizard_core.api import OptimizationParams, Stage
 
 
 class WrappedStage(Stage):
-    """Does everything as the stage inside; a subclass overrides what is its own.
+    """Forwards everything to the inner stage; subclasses override parts.
 
     inner   the stage inside
     opt     hyper-parameters that the tasks of both see; None: those of the stage inside

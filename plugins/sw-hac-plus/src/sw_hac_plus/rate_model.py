@@ -13,7 +13,7 @@ import torch
 from sw_anchors.attribute_sections import ExactNetwork
 from sw_anchors.float_mode import one_thread
 from sw_anchors.rate_model import AnchorForecast, floored
-from sw_anchors.row_parts import EXACT_NUMBERS, FLOAT_NUMBERS, by_parts
+from sw_anchors.row_parts import MAX_EXACT_NUMBERS, MAX_FLOAT_NUMBERS, by_parts
 from torch import Tensor
 
 from sw_codecs.entropy import rates
@@ -126,7 +126,7 @@ class ExactMixtures:
 
     def mixture(self, index: int, columns: slice, first: FirstPrediction, known: Tensor) -> RowMixture:
         """Return the mixtures of slice `index`, its `columns`, once the features [n,i] before it are `known`."""
-        mean, scale, logit = _second(self._channel, index, known, first.context, self._width(index), EXACT_NUMBERS)
+        mean, scale, logit = _second(self._channel, index, known, first.context, self._width(index), MAX_EXACT_NUMBERS)
         grid, _ = first.groups["features"]
         return RowMixture(
             grid.mean[:, columns], grid.scale[:, columns], mean, scale, first.logit[:, columns] - logit, grid.step
@@ -156,7 +156,7 @@ class FloatMixtures:
         """Return the mixtures of slice `index`, its `columns`, once the features [n,i] before it are `known`."""
         with one_thread():
             width = self._channel.width(index)
-            mean, scale, logit = _second(self._channel, index, known, first.context, width, FLOAT_NUMBERS)
+            mean, scale, logit = _second(self._channel, index, known, first.context, width, MAX_FLOAT_NUMBERS)
         (grid, _), base = first.groups["features"], self._model.base_steps[0]
         return RowMixture(
             grid.mean[:, columns], grid.scale[:, columns], (base * mean).clamp(-1e6, 1e6),

@@ -28,7 +28,7 @@ from sw_anchors.rate_model import (
     gaussian_rate,
     triple,
 )
-from sw_anchors.row_parts import FLOAT_NUMBERS, by_parts
+from sw_anchors.row_parts import MAX_FLOAT_NUMBERS, by_parts
 from sw_anchors.shape import GROUPS, AnchorShape
 from torch import Tensor, nn
 
@@ -188,7 +188,7 @@ def float_outputs(model: HACRateModel, codes: Tensor) -> Tensor:
     width = max(model.row_width, model.network[0].out_features)
     with one_thread():
         return by_parts(
-            lambda part: model.network(model.grid(part.to(torch.float32) / TOP)), codes, width, FLOAT_NUMBERS
+            lambda part: model.network(model.grid(part.to(torch.float32) / TOP)), codes, width, MAX_FLOAT_NUMBERS
         )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from sw_gaussians.drawn_as import antialias_of
+from sw_gaussians.render_options import antialias_of
 from sw_gaussians.surfels import gaussians_of
 
 from splatwizard_core.api import GaussianModel

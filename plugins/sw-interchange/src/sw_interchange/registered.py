@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from sw_gaussians.drawn_as import lost_options
+from sw_gaussians.render_options import lost_options
 
 from splatwizard_core.api import GaussianModel, LeftOut, SceneError, SplatModel, origin_of, world_shift
 from sw_interchange.bridge import from_gaussians, to_gaussians

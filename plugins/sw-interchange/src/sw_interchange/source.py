@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from sw_gaussians.mapped import mapped
+from sw_gaussians.memory_map import memory_map
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Source:
     def open(cls, path: str | os.PathLike[str], *, spz_frame: str = "RUB") -> Source:
         """Map a file. Raises SceneError if it cannot be read."""
         where = Path(path)
-        return cls(mapped(where), where.name, where, spz_frame)
+        return cls(memory_map(where), where.name, where, spz_frame)
 
     def head(self, count: int) -> bytes:
         """The first bytes, at most `count`."""

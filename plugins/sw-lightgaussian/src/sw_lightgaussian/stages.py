@@ -5,11 +5,11 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING
 
+from sw_gaussians.adam_moments import restore_moments
 from sw_gaussians.finetune.distillation import DistillationStage
 from sw_gaussians.finetune.fine_tuning import FineTuningStage
 from sw_gaussians.finetune.importance import KeepImportance, ScoredGaussians
 from sw_gaussians.finetune.pruning import PruneByScore
-from sw_gaussians.moments import restore_moments
 from sw_gaussians.statistics import collect_statistics
 from sw_gaussians.surfels import refuse_surfels
 

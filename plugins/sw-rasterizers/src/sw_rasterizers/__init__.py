@@ -1,3 +1,3 @@
-"""Compiled rasterizers for Splatwizard: one C++ and CUDA kernel family, its mathematics shared."""
+"""Compiled rasterizers for CPU (C++) and CUDA, with shared maths headers."""
 
 __version__ = "0.3.0"

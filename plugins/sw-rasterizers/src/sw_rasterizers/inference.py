@@ -1,6 +1,6 @@
-"""Rasterizers for showing and measuring only: faster than `standard`, not exact, CUDA, no gradients.
+"""Inference-only CUDA rasterizers: faster than `standard`, approximate, no gradients.
 
-FlashGS (arXiv 2408.07967) and TC-GS (arXiv 2505.24796) name what each one does with the exponent. Everything before the
+They compute the exponent as in FlashGS (arXiv 2408.07967) and TC-GS (arXiv 2505.24796). Everything before the
 pixels (projection, exact ellipse-tile tests, sorting) is the standard family's.
 """
 
@@ -15,7 +15,7 @@ from sw_rasterizers.standard import StandardRasterizer
 
 
 class InferenceRasterizer(StandardRasterizer):
-    """Base of the two. Images are [3,H,W], float32, or uint8 with `dtype_out="uint8"`: round(255 clamp(x, 0, 1)).
+    """Base of both. Images are [3,H,W], float32, or uint8 with `dtype_out="uint8"`: round(255 clamp(x, 0, 1)).
 
     A pixel draws the splat that brings its transmittance below 1e-4 (the standard rasterizers leave it out) and goes on
     until all 32 pixels of its warp are below. Alpha is still clamped at 0.99 and cut below 1/255.
@@ -38,14 +38,14 @@ class InferenceRasterizer(StandardRasterizer):
 
 
 class FlashRasterizer(InferenceRasterizer):
-    """FlashGS-style: a base-2 exponent with the opacity folded in, a polynomial about the tile's middle."""
+    """FlashGS-style: base-2 exponent including the opacity, a polynomial around the tile centre."""
 
     info: RasterizerInfo = RasterizerInfo.declared(plugin.register_rasterizers, "flash")
     method = Flag.FLASH
 
 
 class TensorCoreRasterizer(InferenceRasterizer):
-    """TC-GS-style: exponents by tensor cores, every coefficient as the sum of two halves, float32 sums.
+    """TC-GS-style: exponents on tensor cores, each coefficient split into two float16, float32 accumulation.
 
     Raises ConfigError for a low-pass below 0.1 px^2: the exponents of sharper splats leave the range of a half.
     """

@@ -1,4 +1,4 @@
-"""The native module: which sources the kernels are compiled from, and whether they can run here."""
+"""Native module of the rasterizer kernels: sources and availability."""
 
 from __future__ import annotations
 

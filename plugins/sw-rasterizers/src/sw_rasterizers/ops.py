@@ -1,4 +1,4 @@
-"""The compiled kernels as one differentiable function of tensors."""
+"""Differentiable rasterization by the compiled kernels (autograd functions)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ BACKWARD_STAGES = ("blend_backward", "project_backward")
 
 
 class Flag(enum.IntFlag):
-    """Switches of one call; those of `Flag` in csrc/binding.h that Python sets."""
+    """Flags of one call; the part of `Flag` in csrc/binding.h that Python sets."""
 
     ANTIALIAS = 1
     CLAMP_COLOR = 2
@@ -62,7 +62,7 @@ class _Drawn:
 
 @dataclass
 class Call:
-    """Everything of one call that is not a tensor to differentiate by, and where its by-products go.
+    """Non-differentiable arguments of one call, and buffers for its by-products.
 
     camera          18 numbers: R, tau, fx, fy, cx, cy, near, far
     geom_indices    [N] int64, rows of scales and quats, none outside: the kernels do not look
@@ -91,7 +91,7 @@ class Call:
 
 
 def camera_numbers(cam: Camera) -> list[float]:
-    """[18]: R row by row, tau, fx, fy, cx, cy, near, far."""
+    """Return the camera as [18] numbers: R row by row, tau, fx, fy, cx, cy, near, far."""
     return [*cam.pose, cam.fx, cam.fy, cam.cx, cam.cy, cam.near, cam.far]
 
 
@@ -131,7 +131,7 @@ class _Rasterize(torch.autograd.Function):
 
 
 def _updates(tensors: dict[str, Tensor | None]) -> tuple[list[Tensor], list[float]]:
-    """Tensors and rates of the updates that the backward pass on CUDA is to do, of sh_dc, of sh_rest; or nothing."""
+    """Return tensors and rates of the Adam updates of sh_dc and sh_rest to fuse into backward on CUDA, if any."""
     offers = [None if (param := tensors.get(name)) is None else offered_update(param) for name in UPDATED]
     if all(u is None for u in offers):
         return [], []
@@ -156,7 +156,7 @@ def _updates(tensors: dict[str, Tensor | None]) -> tuple[list[Tensor], list[floa
 
 
 def _draw_on_cuda(call: Call, tensors: dict[str, Tensor | None]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Draw with gradients on CUDA, where the nodes of autograd are in C++ (csrc/binding_draw_cuda.cpp)."""
+    """Render with gradients on CUDA; the autograd nodes are in C++ (csrc/binding_draw_cuda.cpp)."""
     image, radii, alpha, median, call.counts, seconds, late = torch.ops.sw_rasterizers.draw(
         *map(tensors.get, INPUTS), call.geom_indices, call.visible, call.background, *call.settings(),
         call.grad2d is not None, call.absgrad2d is not None, *_updates(tensors),
@@ -176,7 +176,7 @@ def backward_seconds() -> dict[str, float]:
 
 
 def _hand_out(call: Call, found: list[Tensor], wanted: list[bool]) -> tuple[Tensor | None, ...]:
-    """Gradients in the order of a node's inputs; the statistics go into their buffers."""
+    """Return gradients in the order of the node's inputs; write statistics into their buffers."""
     for buffer, value in ((call.grad2d, found[-2]), (call.absgrad2d, found[-1])):
         if buffer is not None:
             buffer.set(value)
@@ -202,7 +202,7 @@ def _channels(tensors: list[Tensor | None], flags: Flag) -> int:
 
 
 def rasterize(call: Call, tensors: dict[str, Tensor | None]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Draw one view. Differentiable by every tensor of INPUTS; all of one dtype and device.
+    """Render one view. Differentiable with respect to every tensor of INPUTS; all of one dtype and device.
 
     Returns the channels [C + depths + E, H, W] (colours over the background, then inverse and accumulated depth if
     flagged, then features), radii [N] int32, alpha [1,H,W] or [0,H,W], median depth likewise.
@@ -236,7 +236,7 @@ def visible_radii(
     scale_factors: Tensor | None = None,
     geom_indices: Tensor | None = None,
 ) -> Tensor:
-    """Radii [N] int32 from geometry alone; 0 = culled. No gradient."""
+    """Return radii [N] int32, px, from geometry alone; 0 = culled. No gradient."""
     MODULE.load()
     tensors = (means, scales, quats, cov3d, scale_factors, geom_indices, visible)
     geometry = [None if x is None else x.detach().contiguous() for x in tensors]

@@ -3,7 +3,7 @@
 from splatwizard_core.api import Registry, hookimpl
 
 PROFILES = ["3dgs", "dgr-exact"]
-"""Exact support of every splat; or the original's tiles and gradients."""
+"""Profiles: `3dgs` has exact splat support, `dgr-exact` the tiles and gradients of the original code."""
 
 STANDARD_FEATURES = [
     "BACKWARD", "ANTIALIAS", "ABSGRAD", "VISIBLE_FILTER", "COV3D", "COLORS_ND", "EXTRA_FEATURES", "SPLIT_SH",

@@ -1,4 +1,4 @@
-"""How much each Gaussian matters to views: scores and Fisher blocks on compiled kernels."""
+"""Scores and Fisher blocks of Gaussians over views, on compiled kernels."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from sw_rasterizers.native import MODULE
 from sw_rasterizers.ops import Call
 
 KINDS = ("hits", "opacity", "opacity_T", "blend", "blend_max", "gamma", "dist", "grad_sq")
-"""In the order of `enum ScoreKind` in csrc/scores.h."""
+"""Score kinds, in the order of `enum ScoreKind` in csrc/scores.h."""
 MAX_SCORES = 16
-"""Of one call; `kMaxScores` there."""
+"""Largest number of scores per call; `kMaxScores` of csrc/scores.h."""
 FISHER = 21
-"""Upper triangle of a 6x6 block, row by row."""
+"""Length of a Fisher block: upper triangle of 6x6, row by row."""
 
 
 class Totals:
@@ -27,7 +27,7 @@ class Totals:
         self.fisher = like.new_zeros(len(g), FISHER, dtype=torch.float64) if opt.fisher else None
 
     def result(self) -> AccumOutput:
-        """The sums in the dtypes of the contract: counts as int32, all else as float32."""
+        """Return the sums in the contract's dtypes: counts as int32, others as float32."""
         limit = torch.iinfo(torch.int32).max
         scores = {
             spec.name: (row.clamp(max=limit) if spec.dtype == torch.int32 else row).to(spec.dtype)
@@ -47,10 +47,10 @@ def add_scores(g: GaussianInputs, call: Call, opt: RasterOptions, totals: Totals
 
     call    the view as it is drawn without maps and features, which change no score
 
-    Sums are formed per tile in the dtype of the Gaussians and across tiles and views in float64; on the CPU they are
-    bit-equal for any number of threads, on CUDA each (Gaussian, pixel) counts once but the order of additions varies,
-    unless torch is asked for deterministic algorithms: then a Gaussian's sum over the tiles of a view is float32, too.
-    No score is differentiable, and none touches a gradient.
+    Sums per tile are in the dtype of the Gaussians, sums across tiles and views in float64. On the CPU they are
+    bit-equal for any number of threads. On CUDA the order of additions varies, unless torch uses deterministic
+    algorithms; then a Gaussian's sum over the tiles of a view is float32, too. No score is differentiable, and none
+    touches a gradient.
     """
     MODULE.load()
     sh = g.sh
@@ -68,7 +68,7 @@ def add_scores(g: GaussianInputs, call: Call, opt: RasterOptions, totals: Totals
 
 
 def _pixel_weights(specs: tuple[ScoreSpec, ...], like: Tensor) -> tuple[Tensor | None, list[int]]:
-    """The maps [M,H,W] and, for each score, which of them is its own; -1: none."""
+    """Return pixel-weight maps [M,H,W], and the map index per score; -1: none."""
     maps: list[Tensor] = []
     rows = []
     for spec in specs:

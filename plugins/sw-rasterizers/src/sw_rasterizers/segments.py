@@ -1,4 +1,4 @@
-"""Rows of a table by index: checked once, and sorted once where sums over the readers of a row need an order."""
+"""Indices into a codebook: validated once, sorted once where gradient sums need a fixed order."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from splatwizard_core.api import ShapeError
 
 
 class Segments:
-    """Rows of a table that N indices ask for; sorted when first needed, so that sums over equal ones have an order.
+    """N indices into a table, sorted lazily so that sums over equal indices have a fixed order.
 
     indices     [N] int64, each in 0 .. rows - 1
     rows        M, length of the table
@@ -32,24 +32,24 @@ class Segments:
 
     @cached_property
     def order(self) -> Tensor:
-        """[N] int64: the askers, those of row 0 first, each row's in index order."""
+        """Positions [N] int64, sorted by table row, stable."""
         return torch.sort(self.indices, stable=True).indices
 
     @cached_property
     def offsets(self) -> Tensor:
-        """[M+1] int64: where each row's askers begin in `order`."""
+        """Start [M+1] int64 of each table row's segment in `order`."""
         users = torch.arange(self.rows + 1, device=self.indices.device)
         return torch.searchsorted(self.indices[self.order], users)
 
 
 class Tables:
-    """Knows the segments of indices; those that come again unchanged, as at every training step, are looked at once."""
+    """Cache of Segments: unchanged index tensors, as in every training step, are checked once."""
 
     def __init__(self) -> None:
         self._known: WeakIdKeyDictionary = WeakIdKeyDictionary()
 
     def segments(self, indices: Tensor, rows: int) -> Segments:
-        """Indices [N] into a table of so many rows. Raises ShapeError for an index outside."""
+        """Return the Segments of indices [N] into a table of given size. Raises ShapeError if out of range."""
         if indices.is_inference():
             return Segments(indices, rows)  # without a version: nobody would notice a change
         found = self._known.get(indices)

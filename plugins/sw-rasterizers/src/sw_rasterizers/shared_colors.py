@@ -1,8 +1,8 @@
-"""Colours of Gaussians that share SH coefficients, which no Gaussian gets for its own, there or back.
+"""SH colours from a codebook, without gathering coefficients or gradients per Gaussian.
 
 A Gaussian at SH degree 3 has 48 coefficients and one colour of 3 numbers for a view. Gathered, the coefficients, their
-gradient and its copy in the order of the codebook are 3 x 192 bytes a Gaussian. The kernels read them from the codebook
-(csrc/cpu/shared_colors.cpp, csrc/cuda/shared_colors.cu).
+gradient and its copy in the order of the codebook are 3 x 192 bytes per Gaussian. The kernels read them from the
+codebook (csrc/cpu/shared_colors.cpp, csrc/cuda/shared_colors.cu).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from sw_rasterizers.segments import Segments
 
 
 def shared_colors(sh: SH, segments: Segments, means: Tensor, center: Tensor, *, clamp: bool) -> Tensor:
-    """Colours [N,3] of the Gaussians as seen from `center` [3]; differentiable by codebook, dc and means [N,3].
+    """Return colours [N,3] of the Gaussians as seen from `center` [3]; differentiable by codebook, dc and means [N,3].
 
     sh          with a codebook [M,K,3], or dc [N,1,3] and a codebook [M,K-1,3]
     segments    of its indices [N]

@@ -1,4 +1,4 @@
-"""The standard 3DGS rasterizer on compiled kernels, on the CPU and on CUDA."""
+"""The standard 3DGS rasterizer on compiled CPU and CUDA kernels."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from sw_rasterizers.ops import Call, Flag, camera_numbers, rasterize, visible_ra
 from sw_rasterizers.scoring import Totals, add_scores, check_count
 
 CUDA_CHANNELS = 8
-"""`kMaxChunk` of csrc/cuda/kernels.h."""
+"""Channels blended per pass on CUDA: `kMaxChunk` of csrc/cuda/kernels.h."""
 
 
 class StandardRasterizer:
-    """Standard 3DGS with complete gradients; float32, on the CPU also float64 for checking.
+    """Standard 3DGS with gradients of all inputs; float32, on the CPU also float64 for gradient checks.
 
     Profile "3dgs" draws the exact support of every splat, alpha >= 1/255 wherever it reaches, as the reference does.
     Profile "dgr-exact" also cuts each splat at the original's square of 16x16 tiles (3 sigma) and takes over the
@@ -48,7 +48,7 @@ class StandardRasterizer:
         self.count = count
 
     def render(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> RenderResult:
-        """Draw one view; see the protocol. Raises CapabilityError, ConfigError or ShapeError."""
+        """Render one view; see the protocol. Raises CapabilityError, ConfigError or ShapeError."""
         self.info.check_request(g, opt)
         if opt.scores or opt.fisher:
             found = self.accumulate(g, [cam], opt)
@@ -160,7 +160,7 @@ class StandardRasterizer:
 
 
 def _check_absgrad(g: GaussianInputs, flags: Flag) -> None:
-    """Refuse more channels than are blended at once on CUDA: the absolute value of a sum is not that of its parts."""
+    """Raise for more channels than one pass blends on CUDA, since absolute gradients do not add up over passes."""
     asked = "fragment_grad" if Flag.FRAGMENTS in flags else "absgrad"
     channels = 3 if g.colors is None else g.colors.shape[1]
     channels += (Flag.INVERSE_DEPTH in flags) + (Flag.ACCUMULATED_DEPTH in flags)
@@ -187,7 +187,7 @@ def _flags(
     count: bool,
     ordered: bool,
 ) -> Flag:
-    """The switches of the kernels that these options stand for. Raises ConfigError for two that exclude each other."""
+    """Convert options to kernel flags. Raises ConfigError for options that exclude each other."""
     if absgrad and fragments:
         raise ConfigError("absgrad and fragment_grad take the place of each other: ask for one of them")
     quirks = profile == "dgr-exact"

@@ -1,4 +1,4 @@
-"""Surfels (2D Gaussian Splatting) on compiled kernels, on the CPU or on CUDA, where the tensors are."""
+"""Rasterizer of surfels (2D Gaussian Splatting) on compiled CPU and CUDA kernels."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ from sw_rasterizers.ops import BACKWARD_STAGES, FORWARD_STAGES, Call, Flag, came
 INPUTS = ("means", "opacities", "scales", "quats", "sh", "sh_dc", "sh_rest", "colors")
 """Differentiable inputs in the order in which the ops take them and return their gradients."""
 WITH_MAPS = 1 << 20
-"""Flag beside those of ops.py: depth, normals and distortion too; mirrors `kWithMaps` in csrc/binding_surfel.h."""
+"""Flag besides those of ops.py: also depth, normals and distortion; mirrors `kWithMaps` in csrc/binding_surfel.h."""
 MAPS = {"accumulated": slice(0, 1), "inverse": slice(1, 2), "normals": slice(2, 5), "distortion": slice(5, 6),
         "median": slice(6, 7)}  # fmt: skip
-"""Rows of the maps; mirrors `SurfelMap` in csrc/surfel.h."""
+"""Channels of the maps; mirrors `SurfelMap` in csrc/surfel.h."""
 
 
 class SurfelRasterizer:
-    """2DGS with complete gradients; float32, and on the CPU float64 for checking.
+    """2DGS with gradients of all inputs; float32, on the CPU also float64 for gradient checks.
 
-    Draws what the reference draws for scales [N,2]: with profile "3dgs" the exact support of every surfel, with
-    "dgr-exact" cut at the 16x16 tile squares of the published kernels and with the gradient passing through the clamp
-    of alpha (the gradient of depth through the low-pass branch, which those leave out in part, stays exact).
-    The densification statistic is the derivative with respect to a shift of the surfel on the screen.
+    Renders like the reference for scales [N,2]. Profile "3dgs" has the exact support of every surfel. Profile
+    "dgr-exact" cuts surfels at the 16x16 tile squares of the published kernels, and passes gradients through the clamp
+    of alpha. The depth gradient through the low-pass branch, which those kernels omit in part, stays exact. The
+    densification statistic is the derivative with respect to a shift of the surfel on the screen.
 
     count   also count evaluated and blended pixel-surfel pairs into the statistics; slow, for benchmarks; on
             CUDA also the only way to the seconds of the stages, which wait for the device
@@ -50,7 +50,7 @@ class SurfelRasterizer:
         self.count = count
 
     def render(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> RenderResult:
-        """Draw one view; see the protocol. Raises CapabilityError, ConfigError or ShapeError."""
+        """Render one view; see the protocol. Raises CapabilityError, ConfigError or ShapeError."""
         self.info.check_request(g, opt)
         if opt.eps2d != RasterOptions.eps2d:
             from sw_reference.surfels import warn_of_low_pass  # here: nearly nobody asks for it
@@ -191,7 +191,7 @@ def _settings(call: Call, flags: int) -> tuple[Any, ...]:
 
 
 def _draw(call: Call, flags: int, tensors: dict[str, Tensor | None]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Image, radii, alpha and maps; state for the backward pass is kept only if something needs a gradient."""
+    """Return image, radii, alpha and maps; saves state for backward only if an input needs a gradient."""
     MODULE.load()
     inputs = [tensors.get(name) for name in INPUTS]
     dummy = None

@@ -1,4 +1,4 @@
-"""The standard kernels with codebooks of colours and shapes."""
+"""Variant of the standard rasterizer that reads colours and shapes from codebooks."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from sw_rasterizers.standard import StandardRasterizer
 
 
 class IndexedRasterizer(StandardRasterizer):
-    """Codebooks of colours and of shapes, with a scale factor for each Gaussian, read where they are needed.
+    """Renders Gaussians with indexed SH colours and shapes, and a scale factor per Gaussian.
 
     The projection reads scales and quaternions through the index, forward and backward, and `shared_colors` the SH
-    coefficients: what a Gaussian gets of its own is a colour. Gradients of codebook rows are sums over their users: in
-    a fixed order on the CPU, for any number of threads; on CUDA those of shapes are atomic, unless torch is asked for
-    deterministic algorithms: then shapes are gathered. Source: C3DGS (arXiv 2401.02436).
+    coefficients; only the resulting colour is stored per Gaussian. Gradients of codebook rows are summed in a fixed
+    order on the CPU, for any number of threads. On CUDA those of shapes use atomics, unless torch uses deterministic
+    algorithms; then shapes are gathered. Source: C3DGS (arXiv 2401.02436).
     """
 
     info = RasterizerInfo.declared(plugin.register_rasterizers, "c3dgs")
@@ -30,7 +30,7 @@ class IndexedRasterizer(StandardRasterizer):
         self._tables = Tables()
 
     def render(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> RenderResult:
-        """As `standard`; `RenderResult.inputs` are the inputs as they came. Raises ShapeError for a wrong index too."""
+        """Render as `standard`; `RenderResult.inputs` are the given inputs. Raises ShapeError for an invalid index."""
         self.info.check_request(g, opt)
         self._check_shapes(g)
         # Sums over the users of a shape are atomic on CUDA; torch's, of gathered rows, have an order where it is asked.
@@ -45,12 +45,12 @@ class IndexedRasterizer(StandardRasterizer):
 
     @torch.no_grad()
     def visible_filter(self, g: GaussianInputs, cam: Camera) -> Tensor:
-        """Radii [N] int32 from geometry alone; 0 = culled."""
+        """Return radii [N] int32, px, from geometry alone; 0 = culled."""
         self.info.check_geometry(g)
         self._check_shapes(g)
         return super().visible_filter(g, cam)
 
     def _check_shapes(self, g: GaussianInputs) -> None:
-        """Raise ShapeError for an index of a shape outside: the kernels do not look."""
+        """Raise ShapeError for a shape index out of range; the kernels do not check."""
         if g.geom_indices is not None and g.scales is not None:
             self._tables.segments(g.geom_indices, len(g.scales))

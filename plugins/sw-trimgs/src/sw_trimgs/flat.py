@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import torch
 from sw_gaussians.density import rotate
-from sw_gaussians.surfels import THICKNESS, as_ellipsoids
+from sw_gaussians.surfels import SURFEL_THICKNESS, as_ellipsoids
 
 from splatwizard_core.api import GaussianInputs, GaussianModel
 
@@ -36,15 +36,15 @@ class FlatGaussians(GaussianModel):
 
     def __init__(self, *tensors: Tensor, active_sh_degree: int | None = None) -> None:
         super().__init__(*tensors, active_sh_degree=active_sh_degree)
-        self.log_scales.data[:, NORMAL_AXIS] = math.log(THICKNESS)
+        self.log_scales.data[:, NORMAL_AXIS] = math.log(SURFEL_THICKNESS)
         self.register_buffer("neighbors", torch.zeros(0, 0, dtype=torch.int32, device=self.means.device))
         self.draws_surface = False
 
     @property
     def scales(self) -> Tensor:
-        """[N,3] standard deviations, world units; the first is THICKNESS, whatever splits made of its logarithm."""
+        """Standard deviations [N,3], world units; the first is SURFEL_THICKNESS, whatever the stored logarithm."""
         free = self.log_scales[:, 1:].exp()
-        return torch.cat([free.new_full((len(free), 1), THICKNESS), free], dim=1)
+        return torch.cat([free.new_full((len(free), 1), SURFEL_THICKNESS), free], dim=1)
 
     def normals(self, center: Tensor) -> Tensor:
         """[N,3] unit normals in the world, each on the side of `center` [3]; differentiable by the quaternions."""
@@ -64,8 +64,8 @@ class FlatGaussians(GaussianModel):
 
     @torch.no_grad()
     def settle(self) -> None:
-        """Put the first scale back to THICKNESS and forget the neighbours: what a file, or the next stage, gets."""
-        self.log_scales[:, NORMAL_AXIS] = math.log(THICKNESS)
+        """Reset the first scale to SURFEL_THICKNESS and drop the neighbour cache, as for a file or the next stage."""
+        self.log_scales[:, NORMAL_AXIS] = math.log(SURFEL_THICKNESS)
         self.forget_neighbors()
         self.draws_surface = False
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sw_gaussians.drawn_as import antialias_of, eps2d_of
+from sw_gaussians.render_options import antialias_of, eps2d_of
 
 from splatwizard_core.api import Camera, SplatModel, replacing
 from sw_view.packing import pack

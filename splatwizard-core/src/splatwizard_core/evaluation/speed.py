@@ -64,7 +64,7 @@ class SpeedBlock(Block):
 
 
 class SpeedReport(SpeedBlock):
-    """What `measure_speed` tells: of the record's block, what it can know, and besides
+    """Result of `measure_speed`: fields of the record's block that are known at this point, and
 
     first_frame_s       the first frame of all, a part of the warm-up
     peak_bytes          memory over the measured rounds; `memory_kind` says which: "cuda" (allocator) or "rss" (growth)

@@ -21,9 +21,9 @@ from splatwizard_core.plugins.manager import PluginManager
 from splatwizard_core.plugins.registry import Entry
 from splatwizard_core.rendering.adapters import AdaptedRasterizer, adapted_requirements
 from splatwizard_core.rendering.features import Feature
-from splatwizard_core.rendering.held import faults
 from splatwizard_core.rendering.info import RasterizerInfo
 from splatwizard_core.rendering.rasterizer import AccumOutput, Rasterizer, RasterOptions, RenderResult
+from splatwizard_core.rendering.result_checks import faults
 from splatwizard_core.scene.camera import Camera
 from splatwizard_native import ForeseenError, NativeBuildError
 

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from splatwizard_core.errors import ConfigError, SplatwizardError, UserInputError, no_file
+from splatwizard_core.gaussians.invalid_rows import leave_out_senseless
 from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.gaussians.sound import leave_out_senseless
 from splatwizard_core.method import Method
 from splatwizard_core.plugins import PluginManager, load_plugins
 from splatwizard_core.runs.config import INIT, ResolvedConfig, resolve

@@ -149,7 +149,7 @@ class PhaseBlock(Block):
 
 
 class Quality(Block):
-    """What measuring a model on a scene tells, in `sw eval` and in the record alike."""
+    """Measurements of a model on a scene, for `sw eval` and the record."""
 
     dataset: str = Field("unknown", description="family of the scene")
     scene: str = Field(min_length=1)

@@ -1,1 +1,1 @@
-"""training room."""
+"""Training: stages, schedules, optimizer, density-control contract, checkpoints and configuration."""

@@ -1,4 +1,4 @@
-"""Registered schedule tasks that a configuration puts into the plan of a method: `[[tasks]]`."""
+"""Schedule tasks that a configuration adds to a method's plan: `[[tasks]]`."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ _RANGE = re.compile(r"range\(\s*(\d+)\s*(?:,\s*(\d+)\s*)?(?:,\s*(\d+)\s*)?\)")
 
 
 def add_tasks(stages: Sequence[Stage], tasks: Iterable[AddedTask], plugins: PluginManager) -> list[Stage]:
-    """Return the stages of a method with the tasks of a configuration in their plans, after the tasks of their own.
+    """Return a method's stages with the configured tasks added to their plans, after the stages' own tasks.
 
-    Raises ConfigError for a task, stage or setting that is not there, with the nearest, and for steps or values that
-    make no sense; PluginError for a task that is broken.
+    Raises ConfigError for invalid steps or values, and for an unknown task, stage or setting, with the nearest name.
+    Raises PluginError for a task that is broken.
     """
     for number, each in enumerate(tasks, 1):
         where = f"tasks, {number}. '{each.name}'"
@@ -72,7 +72,7 @@ def _made(where: str, asked: AddedTask, plugins: PluginManager) -> Callable[...,
 
 
 def _parsed(where: str, factory: Any, given: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings as the parameters of a factory take them."""
+    """Parse settings by the parameter types of a factory."""
     try:
         hints = typing.get_type_hints(factory.__init__ if inspect.isclass(factory) else factory)
     except (NameError, TypeError):  # names for type checkers alone

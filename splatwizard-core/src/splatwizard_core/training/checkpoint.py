@@ -1,8 +1,8 @@
 """Checkpoints: a safetensors file of all tensors and a JSON file of everything else, written as a pair. No pickle.
 
-`00-0001000.safetensors` + `00-0001000.json`: stage 0 after step 1000. Both carry the same random pair id; the JSON
-file, renamed into place last, makes the pair valid, names the other one and holds a CRC-32 of itself and of every
-tensor. Where the same step is written again, its tensors get another name: at no moment is there half a pair.
+`00-0001000.safetensors` + `00-0001000.json`: stage 0 after step 1000. Both carry the same random pair id. The JSON file
+is renamed into place last, which makes the pair valid. It names the other file and holds a CRC-32 of itself and of
+every tensor. If a step is written again, its tensors get a new name, so the old pair stays valid until then.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ _OURS = re.compile(rf"\.?({_JSON.pattern}|{_TENSORS.pattern})({TEMPORARY}|\.dama
 
 
 class DamagedCheckpointError(CheckpointError):
-    """The pair of files is not what was written; an older one may be."""
+    """The pair of files is damaged; an older pair may be intact."""
 
 
 class Checkpoint(Block, strict=True, frozen=False):
-    """State of a run after a step.
+    """State of a run after one step.
 
     stage, stage_name, step     where it stands; steps count from 1 in each stage
     finished    the stage is over (its last step, or a task stopped it)
@@ -81,7 +81,7 @@ class CheckpointStore:
         self.directory, self.keep = directory, keep
 
     def write(self, checkpoint: Checkpoint) -> Path:
-        """Write the pair atomically, then remove those that are no longer kept; returns the JSON file's path."""
+        """Write the pair atomically, then delete outdated ones; return the JSON file's path."""
         self.directory.mkdir(parents=True, exist_ok=True)
         tensors: dict[str, Tensor] = {}
         pair = secrets.token_hex(16)
@@ -159,14 +159,14 @@ class CheckpointStore:
         return next((_content(path).get("identity") for path in self.paths()), None)
 
     def clear(self) -> None:
-        """Remove every checkpoint file of the directory, and what was to become one."""
+        """Remove every checkpoint file of the directory, unfinished ones included."""
         # What makes a pair valid goes first: a process that ends here leaves no half of one.
         for path in sorted(self.directory.glob("*"), key=lambda p: p.suffix != ".json"):
             if _OURS.fullmatch(path.name):
                 path.unlink()
 
     def _prune(self, stage: int) -> None:
-        """Remove what is not kept any more, now that a checkpoint of `stage` is written."""
+        """Delete checkpoints made obsolete by a new one of `stage`."""
         kept = set()
         for number, paths in itertools.groupby(self.paths(), key=lambda path: int(path.name[:2])):
             for path in itertools.islice(paths, self.keep if number == stage else 1):
@@ -178,7 +178,7 @@ class CheckpointStore:
 
 
 def _content(path: Path) -> dict[str, Any]:
-    """Content of a JSON file, unverified; nothing if it is missing or cannot be read."""
+    """Return the unverified content of a JSON file; empty if it is missing or cannot be read."""
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
         found = json.loads(path.read_text())["content"]
         return found if isinstance(found, dict) else {}
@@ -223,7 +223,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
 
 
 def split_tensors(value: Any, tensors: dict[str, Tensor], path: str = "") -> Any:
-    """`value` as JSON, its tensors put into `tensors` (CPU, contiguous, no shared memory) by their path.
+    """Return `value` as JSON; its tensors (CPU, contiguous, no shared memory) go into `tensors` by path.
 
     Raises TypeError for what is neither a tensor nor JSON-able: it would come back as something else.
     """
@@ -249,7 +249,7 @@ def split_tensors(value: Any, tensors: dict[str, Tensor], path: str = "") -> Any
 
 
 def join_tensors(value: Any, tensors: Mapping[str, Tensor]) -> Any:
-    """Inverse of `split_tensors` (tuples come back as lists)."""
+    """Undo `split_tensors` (tuples come back as lists)."""
     if isinstance(value, dict):
         if TENSOR_KEY in value:
             return tensors[value[TENSOR_KEY]]
@@ -267,7 +267,7 @@ def _crc(tensor: Tensor) -> int:
 
 
 def normalised(identity: Mapping[str, Any]) -> dict[str, Any]:
-    """The identity as it comes back from JSON, so that a fresh one and a stored one can be compared."""
+    """Return the identity after a JSON round trip, so that new and stored ones compare equal."""
     found: dict[str, Any] = json.loads(json.dumps(identity, default=str, sort_keys=True))
     return found
 
@@ -287,6 +287,6 @@ def differences(checkpoint: Checkpoint, identity: Mapping[str, Any], plan: Seque
 
 
 def _short(value: Any) -> str:
-    """A value for a message: digests and long lists are cut."""
+    """Shorten a value for a message: digests and long lists are cut."""
     text = str(value)
     return text if len(text) <= SHOWN_CHARACTERS else f"{text[: SHOWN_CHARACTERS - 3]}..."

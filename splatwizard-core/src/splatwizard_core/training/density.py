@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class DensityControl:
-    """Base of density controls: a subclass says when it adjusts (`rounds`) and how (`adjust`), the rest may stay.
+    """Base of density controls: a subclass implements `rounds` (when) and `adjust` (how); the rest is optional.
 
     Steps are those of the full run; the last one of a run is left out. Statistics with a row for each primitive are
     buffers in `model.ROWS`: they follow rows that come and go.
@@ -39,12 +39,12 @@ class DensityControl:
 
     @property
     def rounds(self) -> range:
-        """Steps that adjust."""
+        """Steps at which `adjust` runs."""
         raise NotImplementedError
 
     @property
     def until(self) -> int:
-        """Step from which on nothing is collected or adjusted any more."""
+        """First step without any collection or adjustment."""
         return self.rounds.stop
 
     def needs(self, step: int) -> frozenset[str]:
@@ -56,25 +56,25 @@ class DensityControl:
         return {}
 
     def begin(self, state: StageContext) -> None:
-        """Get ready for a training, or for going on with one. Raises ConfigError for a model that does not suit."""
+        """Prepare a new or resumed training. Raises ConfigError for an unsuitable model."""
 
     def regularised(self, loss: LossPack, result: RenderResult, step: int) -> LossPack:
         """Return the loss of a step of this run with the control's own terms."""
         return loss
 
     def after_backward(self, state: TrainingState, result: RenderResult) -> None:
-        """Collect statistics of one drawing, whose gradients are there."""
+        """Collect statistics of one render; its gradients exist."""
 
     def adjust(self, state: TrainingState) -> DensityReport:
         """Change the rows of `state.model` with `state.optimizer`. Raises EmptyModel if nothing would be left."""
         raise NotImplementedError
 
     def pre_tasks(self) -> Iterable[DensityTask]:
-        """Return what happens ahead of all else in a step, and so after the update of the step before."""
+        """Return the control's tasks that run first in a step, right after the previous step's update."""
         return ()
 
     def post_tasks(self) -> Iterable[DensityTask]:
-        """Return what happens between backward and update, in order.
+        """Return the control's tasks between backward and update, in order.
 
         An action takes the state; one that takes (state, result) collects: it leaves model and gradients alone.
         """
@@ -82,7 +82,7 @@ class DensityControl:
         yield "adjust density", self.rounds, self.adjust
 
     def finish(self, model: SplatModel) -> None:
-        """Take back from a trained model what `begin` gave it."""
+        """Remove from the trained model what `begin` added."""
 
     def state_dict(self) -> dict[str, Any]:
         """Return what a checkpoint has to hold besides the model: tensors and JSON-able values."""

@@ -1,4 +1,4 @@
-"""Typed blocks of figures: what a training counts and times, as its checkpoints and the result record hold it."""
+"""Measured numbers of a training (counts, times), as stored in checkpoints and the result record."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from splatwizard_core.base.block import Block, MemoryKind, WhyNull
 
 
 class Provided(Block):
-    """A part that served: a registered thing by kind and name, a training `stage`, or a `task` of another package."""
+    """A plugin part used in a run: registered entry, by kind and name, training `stage`, or `task`."""
 
     kind: str
     name: str
@@ -28,7 +28,7 @@ class StagePlan(Block):
 
 
 class LoopFigures(Block):
-    """Figures of the training loop that the record's block `train` holds as the loop has them."""
+    """Numbers of the training loop, copied unchanged into the record's block `train`."""
 
     peak_bytes: Annotated[int | None, WhyNull("not measured")] = Field(
         None,
@@ -45,7 +45,7 @@ class LoopFigures(Block):
 
 
 class TrainingFigures(LoopFigures, frozen=False):
-    """Figures of a training over all its stages and processes; part of every checkpoint.
+    """Numbers of a training over all its stages and processes; part of every checkpoint.
 
     stage_seconds, stage_steps, provided    by name of the stage: its loop without housekeeping, steps done, who served
     rasterizers     features asked for -> who served them
@@ -59,7 +59,7 @@ class TrainingFigures(LoopFigures, frozen=False):
 
     @property
     def steps(self) -> int:
-        """Steps of all stages."""
+        """Total steps of all stages."""
         return sum(self.stage_steps.values())
 
     @property

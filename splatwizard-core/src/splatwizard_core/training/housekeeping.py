@@ -23,13 +23,13 @@ log = logging.getLogger(__name__)
 
 Evaluate = Callable[[SplatModel, int], Mapping[str, Any] | None]
 OnStep = Callable[[SplatModel, TrainingState], None]
-"""Called after each step: (model, the training), which it leaves as they are."""
+"""Callback after each step, (model, training state); must not change them."""
 
 UNREAD_LINES = 8  # log lines whose losses stay on a GPU until they are read together: each reading waits for it
 
 
 class Line(NamedTuple):
-    """A line of the log whose tensors are still to be read; `facts` are plain values."""
+    """A log line whose tensors are still on the device; `facts` are plain values."""
 
     step: int
     total: Tensor
@@ -50,7 +50,7 @@ class Housekeeping:
 
     @contextmanager
     def around(self) -> Iterator[None]:
-        """The loop, timed and on display."""
+        """Time the loop and show its progress."""
         run, state = self.run, self.state
         label = f"train {run.identity.get('method', state.name)}"
         if len(run.stages) > 1:
@@ -92,7 +92,7 @@ class Housekeeping:
             self.clock.start()
 
     def save(self) -> None:
-        """Write a checkpoint of the last step, unless it is there or a task that it cannot hold is still to run."""
+        """Write a checkpoint of the last step unless it exists, or a pending task cannot be saved."""
         run, state = self.run, self.state
         if not state.finished:
             if self._saved_at == state.step:

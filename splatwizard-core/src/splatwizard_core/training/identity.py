@@ -1,4 +1,4 @@
-"""Values of a configuration that differ from its defaults: they tell trainings apart.
+"""Identity of a training: the configuration values that differ from the defaults.
 
 A new key whose default changes nothing is in no identity, so it leaves finished trainings and cached scenes as they
 are. A changed default is in none either: the block that states it counts the change in `DEFAULTS`, which is.
@@ -15,7 +15,7 @@ from splatwizard_core.training.keys import block_of, marked, remove_at
 from splatwizard_core.training.params import Params, SameResult
 
 DEFAULTS = "$defaults"
-"""Key of the counts of changed defaults, by dotted key of their block; not there where no default has changed."""
+"""Key of the counters of changed defaults per block; absent if no default has changed."""
 
 
 def given_values(block: BaseModel, plugins: Any = None) -> dict[str, Any]:

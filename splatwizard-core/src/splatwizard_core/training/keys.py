@@ -1,4 +1,4 @@
-"""Dotted keys of nested configuration blocks: those that exist, their types, and the one nearest to a typo."""
+"""Dotted keys of nested configuration blocks: listing, types, access, and suggestions for typos."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def marked(cls: type[BaseModel], mark: type) -> list[str]:
 
 
 def field_at(cls: type[BaseModel], key: str) -> Any:
-    """Return the type that stands at a dotted key; None if there is no such key.
+    """Return the type of a dotted key; None if there is no such key.
 
     Keys of a dict field are free; below one of `Any` or `object` they are free all the way down.
     """

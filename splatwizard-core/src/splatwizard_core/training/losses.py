@@ -14,7 +14,7 @@ WINDOW = 11  # pixels
 
 @dataclass
 class LossPack:
-    """The loss of one step: `total` is what backward starts from, `parts` are what the log shows (scalars)."""
+    """Loss of one step: `total` is differentiated, `parts` are logged (scalars)."""
 
     total: Tensor
     parts: dict[str, Tensor] = field(default_factory=dict)

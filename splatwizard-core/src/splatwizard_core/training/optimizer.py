@@ -1,4 +1,4 @@
-"""One Adam over named parameters of a model, whose rows may come and go while it trains."""
+"""Adam over named parameters of a model whose rows (primitives) are added and removed during training."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class ParamGroup:
 
 @dataclass
 class AdamState:
-    """The state of one parameter.
+    """Adam's state of one parameter.
 
     step        updates so far
     tensors     "exp_avg" and "exp_avg_sq", of the parameter's shape; a subclass of the optimizer may keep more that
@@ -89,7 +89,7 @@ class SplatOptimizer:
         self.update([update for _, update in self.due()])
 
     def due(self) -> Iterator[tuple[str, AdamUpdate]]:
-        """Each parameter that has a gradient, by name, with its next update, which is counted as done."""
+        """Return parameters with a gradient by name, with their next update; counts the step as done."""
         for name, group_name in self._group_of.items():
             param = _parameter(self.model, name)
             if param.grad is None:
@@ -108,7 +108,7 @@ class SplatOptimizer:
         return self.states[name]
 
     def update(self, updates: Sequence[AdamUpdate]) -> None:
-        """Do these updates, densely."""
+        """Apply these updates to all rows."""
         adam_steps(updates)
 
     def zero_grad(self) -> None:
@@ -239,7 +239,7 @@ class SplatOptimizer:
         self.states = loaded
 
     def _prefix(self, model: SplatModel) -> str:
-        """Place of `model` in the optimizer's model: "" for itself, "inner." for a submodule."""
+        """Return the name prefix of `model` in the optimizer's model: "" for itself, "inner." for a submodule."""
         for path, module in self.model.named_modules():
             if module is model:
                 return f"{path}." if path else ""

@@ -1,4 +1,4 @@
-"""Values put into a configuration by dotted key: parsed by the field's type, checked, and wrong ones explained."""
+"""Overrides of configuration values by dotted key: parsed by field type, checked, errors explained."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def _bounded(value: Any) -> Any:
 
 
 def unknown_key(key: str, known: Collection[str], source: str) -> ConfigError:
-    """Make the error for a key that nothing has: it names the nearest valid one."""
+    """Make the error for an unknown key, with the nearest valid one."""
     near = suggest(key, list(known))
     hint = f"did you mean '{near}'?" if near else _keys_beside(key, known)
     return ConfigError(f"unknown key '{key}' in {source}: {hint}", key=key)
@@ -73,7 +73,7 @@ def _bad_value(
 
 
 def _keys_beside(key: str, known: Collection[str]) -> str:
-    """List what there is instead: the keys of the block that it names, else those at the top."""
+    """List alternatives: the keys of the named block, else top-level keys."""
     block = key.rpartition(".")[0]
     inside = sorted(k for k in known if block and k.startswith(f"{block}."))
     if inside:

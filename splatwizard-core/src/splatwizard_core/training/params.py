@@ -1,4 +1,4 @@
-"""Typed configuration: what belongs to the run, and what belongs to the method."""
+"""Typed configuration of a run (`PipelineParams`) and of a method (`OptimizationParams`)."""
 
 import dataclasses
 import difflib
@@ -15,15 +15,15 @@ ParamsT = TypeVar("ParamsT", bound="Params")
 
 
 class ReadsFile:
-    """Marks a field that names a file: what the file holds, not where it lies, tells two trainings apart."""
+    """Marks a field that names a file: its content, not its path, enters the training identity."""
 
 
 InputFile = Annotated[str, ReadsFile()]
-"""The type of a field for the path of a file that training reads; empty for none."""
+"""Field type for the path of a file that training reads; empty: none."""
 
 
 class SameResult:
-    """Marks a field that says how something is computed, not what: trainings that differ in it alone are the same."""
+    """Marks a field that changes how something is computed, not the result; not part of the training identity."""
 
 
 HowInt = Annotated[int, SameResult()]

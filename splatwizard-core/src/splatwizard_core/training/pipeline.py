@@ -1,4 +1,4 @@
-"""All training stages of a run, one after the other, resumed where an earlier process left off."""
+"""Runs all training stages in order, resuming from checkpoints of an earlier process."""
 
 from __future__ import annotations
 
@@ -196,7 +196,7 @@ class TrainingRun:
         return state.stage.finish(state.model, self.scene)
 
     def _resumed(self, saved: Checkpoint) -> Trainer:
-        """`_restore`, and what the record has accumulated, which the trainer's clock goes on from."""
+        """Restore a trainer, and continue its clock from the accumulated numbers."""
         self.figures = saved.progress
         return self._restore(saved)
 
@@ -236,7 +236,7 @@ class TrainingRun:
         return StagePlan(stage=name, iterations=stage.iterations, tasks=tasks, looked_up=looked_up)
 
     def _run_stage(self, trainer: Trainer) -> None:
-        """Train a stage to its end, with its last checkpoint. Raises TrainingStopped where the run is to stop."""
+        """Train a stage to its end and write its last checkpoint. Raises TrainingStopped at `stop_after`."""
         state, stop_after = trainer.state, self.stop_after
         before = self.figures.steps - self.figures.stage_steps.get(state.name, 0)
         until = state.iterations if stop_after is None else min(state.iterations, stop_after - before)

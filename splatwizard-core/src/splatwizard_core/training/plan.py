@@ -1,4 +1,4 @@
-"""When tasks run: the forms a plan may take, how they are scaled, printed and compared."""
+"""Plans: the steps at which tasks run, and how they are scaled, printed and compared."""
 
 from __future__ import annotations
 
@@ -176,7 +176,7 @@ def format_plan(
 
 
 def plan_lines(registrations: Sequence[Registration]) -> list[str]:
-    """Return what identifies a plan: stage, name, every step and the priority of each registration, in their order."""
+    """Return lines that identify a plan: stage, name, steps and priority of each registration, in order."""
     lines = []
     for r in registrations:
         # describe_when abbreviates lists; what identifies a plan may not.

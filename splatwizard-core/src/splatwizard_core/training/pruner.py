@@ -13,7 +13,7 @@ from splatwizard_core.scene.camera import Camera
 
 
 class Pruner(Protocol):
-    """Scores primitives; how many go is the caller's business.
+    """Scores primitives; the caller decides how many are removed.
 
     What is registered is a class whose settings all have defaults, so that any method can use any pruner.
 
@@ -26,7 +26,7 @@ class Pruner(Protocol):
     def score(
         self, model: SplatModel, cameras: Sequence[Camera], rasterizer: Rasterizer, background: Tensor | None = None
     ) -> Tensor:
-        """[N] float, one for each row of the model, higher = keep; -inf for what no camera sees.
+        """Return scores [N] float, one per row of the model, higher = keep; -inf for rows that no camera sees.
 
         background  [3] what the scene is drawn on, 0..1; None: black
 

@@ -76,12 +76,12 @@ class Scheduler:
         self.registrations = sorted(changed, key=_order)
 
     def check(self, context: TaskContext) -> None:
-        """Raise TaskSignatureError now for what would otherwise fail at the step that first needs it."""
+        """Raise TaskSignatureError early for arguments that would fail at the task's first step."""
         for entry in self.registrations:
             entry.binding.check(context, skip=(*POST_ONLY, "scheduler"))
 
     def exec(self, step: int, context: TaskContext) -> bool:
-        """Run what is due at `step`; returns whether a task asked to stop. Past the last plan it does nothing.
+        """Run the tasks due at `step`; return whether one asked to stop. No-op past the end of all plans.
 
         Raises TaskError that names the task, the cause chained.
         """
@@ -104,14 +104,14 @@ class Scheduler:
         return stop
 
     def pending_late(self, step: int) -> bool:
-        """Whether something that a task registered is still to run after `step`.
+        """Return whether a task registered by another task is still to run after `step`.
 
         A checkpoint cannot hold it, so none is written until it has run: a resumed run repeats the registration.
         """
         return any(e.after > 0 and e.fires_in(step, None) for e in self.registrations)
 
     def plan_lines(self) -> list[str]:
-        """Return what identifies the plan: everything but what tasks registered while they ran."""
+        """Return lines that identify the plan, without tasks registered by running tasks."""
         return plan_lines([e for e in self.registrations if e.after == 0])
 
 

@@ -1,4 +1,4 @@
-"""A training stage: the scene that it starts from, its schedule, its loss, its optimizer."""
+"""Base class of training stages: schedule, loss, optimizer, rendering options."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class CameraSampler:
-    """The order in which views are trained. Its whole state can be saved and restored.
+    """Samples training views; its state can be saved and restored.
 
     Default: uniformly without replacement over the training views, refilled when empty.
     A stage with its own idea (pseudo views, say) subclasses it; a view without a picture is legal if the
@@ -61,7 +61,7 @@ class CameraIterator(list[View]):
 
 @dataclass
 class StageContext:
-    """The parts of a run that a stage is given when it begins.
+    """Inputs of a stage from the run: scene, rasterizer, config and more.
 
     model       the model as the stage before left it (or as `Method.create_model` made it)
     scene       the scene
@@ -91,7 +91,7 @@ class PlannedTask(NamedTuple):
 
 
 class Stage:
-    """One training stage of a method. Subclass, override what differs; another method can take it over whole.
+    """One training stage of a method: subclass it and override what differs.
 
     name        shown in plans and logs
     opt         the hyper-parameters that its tasks see as OptimizationParams; a borrowed stage brings its own
@@ -107,7 +107,7 @@ class Stage:
 
     @property
     def iterations(self) -> int:
-        """Steps s = 1 .. iterations."""
+        """Number of steps; s = 1 .. iterations."""
         return self.opt.iterations
 
     @property
@@ -129,11 +129,11 @@ class Stage:
 
     @property
     def prefer(self) -> tuple[str, ...]:
-        """Rasterizers to take first if they are installed; the user's `raster.prefer` goes before them."""
+        """Preferred rasterizers, if installed; the user's `raster.prefer` takes precedence."""
         return ()
 
     def random_background(self, step: int) -> bool:
-        """Whether this step has a background colour of its own, behind render and picture, without the run's asking.
+        """Return whether this step uses a random background for render and image, whatever the run asks.
 
         It has none where `legacy_8bit_composite` has taken alpha away.
         """
@@ -152,25 +152,25 @@ class Stage:
         return context.model
 
     def create_optimizer(self, model: SplatModel, scene: Scene) -> SplatOptimizer:
-        """Parameter groups and learning rates."""
+        """Return the optimizer, with parameter groups and learning rates."""
         raise NotImplementedError
 
     def create_sampler(self, scene: Scene, generator: torch.Generator) -> CameraSampler:
-        """Return the sampler that says which view is trained next."""
+        """Return the sampler of training views."""
         return CameraSampler(scene.train, generator)
 
     def when(self, when: When) -> When:
-        """Return a plan of the full run in steps of this one: scaled with `opt.scale_schedule`, else as it is."""
+        """Scale a plan of the full schedule to this run if `opt.scale_schedule`, else return it unchanged."""
         return scaled(when, self.opt.schedule_scale)
 
     def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
-        """Register what runs before rendering, at the steps of `self.when(plan of the full run)`."""
+        """Register a task that runs before rendering, at the steps of `self.when(plan of the full run)`."""
 
     def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
-        """Register what runs between backward and the optimizer step, at the steps of `self.when(...)`."""
+        """Register a task between backward and the optimizer step, at the steps of `self.when(...)`."""
 
     def raster_options(self, step: int, background: Tensor) -> RasterOptions:
-        """Return how this step is rendered. The last step asks for every feature that any step asks for."""
+        """Return the render options of this step. The last step must ask for every feature of any step."""
         return RasterOptions(background=background)
 
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:

@@ -1,4 +1,4 @@
-"""The one object that a training is: what its tasks are given, its observers read, and its checkpoints hold."""
+"""Complete state of a training: arguments of tasks, view of observers, content of checkpoints."""
 
 from __future__ import annotations
 
@@ -88,12 +88,12 @@ class TrainingState(TaskContext):
 
     @property
     def device(self) -> torch.device:
-        """Where the model is."""
+        """Device of the model."""
         return self.model.device
 
     @property
     def stage_name(self) -> str:
-        """Name of the stage, as it calls itself."""
+        """Name of the stage."""
         return self.stage.name
 
     @property
@@ -108,7 +108,7 @@ class TrainingState(TaskContext):
 
     @property
     def num_rows(self) -> int:
-        """Primitives, such as Gaussians; 0 for a model without such."""
+        """Number of primitives, such as Gaussians; 0 for a model without any."""
         return self.model.num_rows if self.model.ROWS else 0
 
     @property
@@ -122,11 +122,11 @@ class TrainingState(TaskContext):
         return self.log.scalars
 
     def plan_lines(self) -> list[str]:
-        """Return what identifies the plan of the stage."""
+        """Return lines that identify the stage's plan."""
         return [*self.pre.plan_lines(), *self.post.plan_lines()]
 
     def checkpoint(self, identity: Mapping[str, Any]) -> Checkpoint:
-        """Return what a checkpoint of this step holds.
+        """Return the checkpoint of this step.
 
         identity    what the training depends on besides its plan
         """

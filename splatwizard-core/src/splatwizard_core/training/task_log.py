@@ -1,4 +1,4 @@
-"""Lines and values that the schedule tasks of a step leave: for the terminal, log.jsonl, reports, and observers."""
+"""Messages and curve values from schedule tasks, for the terminal, log.jsonl, reports and observers."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 class TaskLog:
-    """Takes what the tasks of one step say and measure; a task asks for it by this annotation.
+    """Collects messages and values of one step's tasks; a task gets it through this annotation.
 
     task        name of the task that runs
     said        (task, line), in order; an empty line: it was registered with `log`

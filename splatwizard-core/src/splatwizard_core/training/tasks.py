@@ -1,4 +1,4 @@
-"""The values that a schedule task may ask for, bound to its parameters by their type annotations."""
+"""Arguments of schedule tasks, bound to their parameters by type annotation."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from splatwizard_core.training.task_log import TaskLog
 
 @dataclass
 class TaskContext:
-    """The values that tasks are given, by the field that an annotation selects.
+    """Values passed to tasks; an annotation selects the field.
 
     step        the current step, 1-based
     cameras     the task camera iterator, independent of the training sampler
@@ -63,7 +63,7 @@ SOURCES: dict[type, str] = {
 """Annotation class (or a subclass of it) -> field of TaskContext. The module of the scheduler adds that."""
 
 EXACTLY: dict[type, str] = {int: "step", nn.Module: "model"}
-"""Classes that stand for a field themselves, but not by their subclasses."""
+"""Annotation classes that select a field, without their subclasses."""
 
 POST_ONLY = ("result", "loss")
 

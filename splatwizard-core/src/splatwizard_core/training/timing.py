@@ -1,4 +1,4 @@
-"""Clocks of a training loop: its whole time, and the time of each stage of a step."""
+"""Clocks of a training loop: total time, and time per stage of a step."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import torch
 from splatwizard_native import synchronize, work_time
 
 STAGES = ("pre", "render", "loss", "backward", "post", "optimize")
-"""The five stages of a step, the third in its two halves."""
+"""The five stages of a step; the third is timed in two halves."""
 
 
 class LoopClock:

@@ -1,7 +1,7 @@
-"""The loop of one training stage: pre tasks, render, loss, post tasks, optimizer. It knows no method.
+"""Training loop of one stage, independent of the method: pre tasks, render, loss, post tasks, optimizer.
 
-What published numbers depend on: post tasks run between backward and the optimizer step; a parameter that a task
-has replaced has no gradient and is skipped; the last step makes no update.
+Published numbers depend on three rules. Post tasks run between backward and the optimizer step. A parameter that a task
+has replaced has no gradient and is skipped. The last step makes no update.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ waited for. A loss that is not finite ends the training at most twice as many st
 
 
 class Loss(NamedTuple):
-    """Loss of a step whose finiteness is still to be looked at; `total` and `parts` are detached scalars."""
+    """Loss of a step, not yet checked to be finite; `total` and `parts` are detached scalars."""
 
     step: int
     view: str
@@ -56,7 +56,7 @@ class Trainer:
         self._asked: tuple[Verdict, list[Loss]] | None = None
 
     def run(self, until: int, after_step: Callable[[TrainingState], None]) -> None:
-        """Run the steps after `state.step` up to `until`, or to the one after which a task wants to stop.
+        """Run steps from `state.step` + 1 to `until`, or until a task asks to stop.
 
         after_step  housekeeping, called between steps, when the state is whole
 
@@ -141,7 +141,7 @@ class Trainer:
         engine.run_backward((total,), (self._one,), False, False, (), allow_unreachable=True, accumulate_grad=True)
 
     def _keep(self, loss: LossPack) -> None:
-        """Keep the loss of the step in the state, and look at those since the last look now and then."""
+        """Store the step's loss in the state; check all unchecked losses every CHECK_EVERY steps."""
         state = self.state
         state.total = loss.total.detach()
         state.parts = {name: part.detach() if part.requires_grad else part for name, part in loss.parts.items()}
@@ -158,7 +158,7 @@ class Trainer:
         self._look()  # hears what the first has asked
 
     def _look(self) -> None:
-        """Hear what was asked at the last look, or raise TrainingDiverged; ask about the losses since."""
+        """Read the result of the previous check, or raise TrainingDiverged; start a check of newer losses."""
         asked, self._asked = self._asked, None
         if asked is not None and not asked[0].fine():
             record = next(r for r in asked[1] if not math.isfinite(r.total.item()))
@@ -185,7 +185,7 @@ class Trainer:
             raise EmptyModel(self.state.step)
 
     def _camera(self, view: View) -> Camera:
-        """Return the view's camera on the model's device, where it is moved once."""
+        """Return the view's camera on the model's device, copied once per view."""
         if view not in self._cameras:
             self._cameras[view] = view.camera.to(self.device)
         return self._cameras[view]

@@ -1,4 +1,4 @@
-"""An exact context network and the lattice of the coder by one kernel: no means or scales in between."""
+"""Exact context network and coder lattice in one kernel, without intermediate means and scales."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from splatwizard_native import fast_enabled
-from sw_anchors.row_parts import EXACT_NUMBERS, parts_of
+from sw_anchors.row_parts import MAX_EXACT_NUMBERS, parts_of
 from sw_anchors.shape import GROUPS, AnchorShape
 from sw_codecs.context.integer_mlp import IntegerMlp, for_kernel
 from sw_codecs.entropy.exact_tables import exact_tables
@@ -18,7 +18,7 @@ from sw_codecs.exact_native import EXACT
 
 
 class Network(Protocol):
-    """Members of an ExactNetwork that are read here."""
+    """Protocol of the ExactNetwork members read here."""
 
     network: IntegerMlp
     shape: AnchorShape
@@ -37,7 +37,7 @@ def on_lattice(
     steps = torch.empty(n, len(columns), dtype=torch.int64)
     multipliers = torch.from_numpy(exact_tables().multipliers + of.step_offset)
     thresholds, weights, start = torch.from_numpy(exact_tables().thresholds), of.network.tensors(), 0
-    for part in parts_of(places, width, EXACT_NUMBERS) if n else ():
+    for part in parts_of(places, width, MAX_EXACT_NUMBERS) if n else ():
         at = slice(start, start + len(part))
         into = [c[at] for c in centre], [c[at] for c in number], steps[at]
         if torch.ops.sw_codecs_exact.forecast([for_kernel(features(part))], weights, multipliers, thresholds, *into):

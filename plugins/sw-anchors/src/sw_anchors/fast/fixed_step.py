@@ -1,4 +1,4 @@
-"""The decoding of a training step in tensors of one capacity: what it reads, what it computes.
+"""Anchor decoding of a training step in tensors of fixed capacity, for CUDA graphs.
 
 Everything that `CodedAnchors.attributes` and `network_outputs` do, with masks in place of shapes that depend on values.
 Nothing in `decode_rows` waits for a GPU, draws at random or writes into what it reads. Gaussians are decoded after it,
@@ -27,11 +27,11 @@ from sw_anchors.rate_model import AnchorForecast, AnchorRate, Context, RateModel
 from sw_anchors.shape import AnchorShape
 
 PARAMETERS = ("features", "log_scales", "offsets", "mask_logits")
-"""Parameters with a row per anchor that the decoding depends on."""
+"""Per-anchor parameters that the decoding reads."""
 
 
 class Model(Protocol):
-    """Members of a `CodedAnchors` that its decoding reads."""
+    """Protocol of the `CodedAnchors` members that decoding reads."""
 
     phase: str
     sample: float
@@ -84,7 +84,7 @@ class Model(Protocol):
 
 @dataclass(frozen=True)
 class FixedRows:
-    """Rows of the visible anchors in tensors of capacity C; the first `count` hold, the rest is what was there before.
+    """Rows of the visible anchors in tensors of capacity C; the first `count` are valid, the rest is stale.
 
     count       scalar float
     center      [3] of the camera
@@ -104,7 +104,7 @@ class FixedRows:
     random: Tensor
 
     def load(self, model: Model, camera: Camera, rows: SeenRows, parts: Sequence[Tensor]) -> None:
-        """Copy the anchors `rows` of the model, and draw anew; C is their capacity."""
+        """Copy the anchors `rows` of the model into the buffers of capacity C, and draw new noise."""
         rows.write_number(self.count)
         self.center.copy_(camera.center)
         weights = model.mask_weights()
@@ -122,7 +122,7 @@ class FixedRows:
 
 @dataclass(frozen=True)
 class PoolRows:
-    """A sample of all anchors in S rows; those that no anchor was drawn for stand for the last one and do not count.
+    """A sample of all anchors in S rows; unused rows repeat the last anchor and are not counted.
 
     rows        [S] int64 of the model
     counted     [S] 1 where an anchor was drawn, else 0
@@ -155,7 +155,7 @@ class PoolRows:
 
 
 def decode_rows(model: Model, at: FixedRows, pool: PoolRows | None) -> Found:
-    """Compute all that does not depend on which Gaussians are visible; rows beyond the count have masks 0.
+    """Compute everything independent of which Gaussians are visible; rows beyond the count have masks 0.
 
     Returns (the three outputs of the networks, offsets [C,k,3], scales [C,6], masks [C,k], then with a rate its bits
     and, if the rate model has any, own bits), and (by_group and numbers of the rate).
@@ -209,7 +209,7 @@ def _rate(
 
 
 def sample_of(draws: Tensor, valid: Tensor, share: float) -> tuple[Tensor, Tensor]:
-    """(rows [S] int64 whose draw [C] of U(0,1) is below `share` and that are valid, 1 where there was one, else 0).
+    """Return valid rows [S] int64 whose sample of U(0,1) [C] is below `share`, and 1 per row used, else 0.
 
     S is fixed: six standard deviations above the mean of C draws. Places that no row was drawn for name the last row,
     which must not be valid.
@@ -224,12 +224,12 @@ def sample_of(draws: Tensor, valid: Tensor, share: float) -> tuple[Tensor, Tenso
 
 
 def sample_capacity(capacity: int, share: float) -> int:
-    """Rows of a sample of `share` of `capacity` rows."""
+    """Return the capacity S of a sample of `share` of `capacity` rows."""
     return min(capacity, math.ceil(capacity * share + 6 * math.sqrt(capacity * share * (1 - share)) + 8))
 
 
 def bernoulli_rows(uniform: Tensor, count: int, share: float) -> tuple[Tensor, Tensor]:
-    """Draw each of `count` > 0 rows with probability `share`, without waiting for a GPU to say how many there are.
+    """Sample each of `count` > 0 rows with probability `share`, without waiting for a GPU to count them.
 
     uniform     [S] draws of U(0,1), one for each place of the sample; what more were drawn is left out
 
@@ -246,7 +246,7 @@ def bernoulli_rows(uniform: Tensor, count: int, share: float) -> tuple[Tensor, T
 
 
 def inputs_of(model: Model, at: FixedRows, rows: SeenRows, found: Found) -> GaussianInputs | None:
-    """The Gaussians with opacity > 0, from what `decode_rows` found; anchors `rows` are those that were loaded.
+    """Return the Gaussians with opacity > 0 from the results of `decode_rows`; `rows` are the loaded anchors.
 
     None: more anchors are seen than there were places for. Waits for the device once, for the number of Gaussians.
     """

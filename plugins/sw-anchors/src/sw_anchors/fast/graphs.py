@@ -1,4 +1,4 @@
-"""Execution of a differentiable computation whose inputs and outputs stay at one place in memory.
+"""CUDA-graph capture of a differentiable computation with fixed input and output tensors.
 
 `CapturedStep` records it as two CUDA graphs, forward and backward, which the host then starts with one call each
 instead of hundreds. `PlainStep` is the same without graphs. Both compute from tensors that their owner fills
@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 
-WARM_UPS = 3
+WARM_UP_RUNS = 3
 """Runs before a device's first capture, in which libraries set themselves up; as torch's own `make_graphed_callables`.
 Before a later one there is one, which loads what its shapes need."""
 
@@ -26,7 +26,7 @@ Found = tuple[tuple[Tensor, ...], tuple[Tensor, ...]]
 
 
 class FixedStep(Protocol):
-    """One computation on fixed tensors."""
+    """Protocol of one computation on fixed tensors."""
 
     def forward(self) -> Found:
         """Compute from the inputs as they are now; the tensors hold until the next call."""
@@ -72,7 +72,7 @@ class CapturedStep:
         stream.wait_stream(current)
         # In this thread, or the engine's own would launch what this one's stream is to record.
         with torch.cuda.stream(stream), torch.enable_grad(), torch.autograd.set_multithreading_enabled(False):
-            for _ in range(WARM_UPS if current.device_index not in _WARM else 1):
+            for _ in range(WARM_UP_RUNS if current.device_index not in _WARM else 1):
                 results, _ = compute()
                 slopes = tuple(torch.zeros_like(each) for each in results)
                 differentiate(results, inputs, slopes)
@@ -115,7 +115,7 @@ def _side_stream(device: int) -> torch.cuda.Stream:
 
 @contextmanager
 def _recording(graph: torch.cuda.CUDAGraph, pool: tuple[int, int] | None) -> Iterator[None]:
-    """Record the current stream. `torch.cuda.graph` would also return all free memory to the driver each time."""
+    """Capture the current stream, unlike `torch.cuda.graph` without emptying the allocator's cache."""
     collecting = gc.isenabled()
     gc.disable()  # a graph or an event that is freed meanwhile would end the capture
     try:
@@ -160,7 +160,7 @@ def add_gradients(parameters: Sequence[Tensor], grads: Sequence[Tensor | None]) 
 
 @dataclass
 class Watched:
-    """Parameters and buffers that a captured computation reads where they stood.
+    """Parameters and buffers whose addresses a captured computation reads.
 
     tensors     of each: the dict that holds it, its name there, itself, its address, whether it learns
     """
@@ -186,7 +186,7 @@ class Watched:
         return [tensor for _, _, tensor, _, learns in self.tensors if learns]
 
     def unchanged(self) -> bool:
-        """Whether each is still the same, at its address, and learns if it did."""
+        """Return whether each tensor is still the same object at the same address, with the same requires_grad."""
         return all(
             held.get(name) is tensor and tensor.data_ptr() == address and tensor.requires_grad == learns
             for held, name, tensor, address, learns in self.tensors

@@ -1,7 +1,7 @@
-"""Networks of anchors and the Gaussians that they spawn as one kernel each way, on the CPU.
+"""Anchor networks and Gaussian spawning fused: one CPU kernel each for forward and backward.
 
-Hidden layers of all three networks are one product; of the networks of shapes and colours only the outputs of Gaussians
-that are drawn are computed, which are fewer than half (benchmarks/train_anchors.py).
+Hidden layers of all three networks are one matrix product. The covariance and colour networks compute only the outputs
+of rendered Gaussians, fewer than half (benchmarks/train_anchors.py).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def spawn(
     masks: Tensor | None,
     networks: Networks,
 ) -> NeuralGaussians:
-    """As `neural_gaussians.spawn`, where it `fits`."""
+    """Fast version of `neural_gaussians.spawn`; requires `fits`."""
     found = _Heads.apply(center, positions, features, offsets, scales, masks, *parameters_of(networks))  # type: ignore[no-untyped-call]
     return NeuralGaussians(*found)
 

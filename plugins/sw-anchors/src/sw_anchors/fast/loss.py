@@ -1,4 +1,4 @@
-"""Terms of the loss as single nodes of the graph of derivatives: a step is bound by how many operators are launched."""
+"""Loss terms as single autograd nodes, since launching operators dominates the cost of a step."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch.autograd.function import once_differentiable
 
 
 def mean_product(scales: Tensor) -> Tensor:
-    """As `stage.mean_product`, whose backward looks for zeros and so waits for a GPU."""
+    """Fast version of `stage.mean_product`, whose backward tests for zeros and so waits for a GPU."""
     found: Tensor = _MeanProduct.apply(scales)  # type: ignore[no-untyped-call]
     return found
 
@@ -32,7 +32,7 @@ class _MeanProduct(torch.autograd.Function):
 
 
 def weighted_sum(start: Tensor, *terms: tuple[float, Tensor]) -> tuple[Tensor, ...]:
-    """As `stage.weighted_sum`, where a product and a sum per term launch four kernels each for one number."""
+    """Fast version of `stage.weighted_sum`, which launches four kernels per scalar term."""
     found: tuple[Tensor, ...] = _WeightedSum.apply([weight for weight, _ in terms], start, *(t for _, t in terms))  # type: ignore[no-untyped-call]
     return found
 

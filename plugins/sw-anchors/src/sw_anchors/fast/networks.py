@@ -1,7 +1,7 @@
-"""Outputs of the three networks of anchors for a view: one node of the graph of derivatives.
+"""The three anchor networks of a view as one autograd node.
 
-A step of training is bound by how many operators the host has to launch, not by what they compute: the first layers of
-all three are one product, and the gradient is written down (benchmarks/train_anchors.py).
+Operator launches, not arithmetic, limit a training step. So the first layers of all three are one matrix product, and
+the gradient is explicit (benchmarks/train_anchors.py).
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from torch.autograd.function import once_differentiable
 from sw_anchors.native import ANCHORS
 from sw_anchors.neural_gaussians import Networks
 
-MOST_FEATURES, MOST_HIDDEN, MOST_OUTPUTS, BLOCK_BYTES = 51, 51, (16, 80, 32), 164_352
-"""That the CUDA kernel has room for, and the shared memory of its blocks: see kernels/cuda/networks.h."""
+MAX_FEATURES, MAX_HIDDEN, MAX_OUTPUTS, BLOCK_BYTES = 51, 51, (16, 80, 32), 164_352
+"""Size limits of the CUDA kernel, and its shared memory per block: see kernels/cuda/networks.h."""
 
 
 def network_outputs(
@@ -41,9 +41,9 @@ def fits_kernel(positions: Tensor, features: Tensor, parameters: Sequence[Tensor
     if not all(t.is_cuda and t.dtype == torch.float32 for t in (positions, features, *parameters)):
         return False
     hidden, outputs = {len(bias) for bias in parameters[1::4]}, [len(bias) for bias in parameters[3::4]]
-    if len(hidden) > 1 or max(hidden) > MOST_HIDDEN or features.shape[1] > MOST_FEATURES or features.stride(1) != 1:
+    if len(hidden) > 1 or max(hidden) > MAX_HIDDEN or features.shape[1] > MAX_FEATURES or features.stride(1) != 1:
         return False
-    if any(count > most for count, most in zip(outputs, MOST_OUTPUTS, strict=True)):
+    if any(count > most for count, most in zip(outputs, MAX_OUTPUTS, strict=True)):
         return False
     room = torch.cuda.get_device_properties(features.device).shared_memory_per_block_optin
     return room >= BLOCK_BYTES and ANCHORS.has_cuda()
@@ -108,5 +108,5 @@ class _Outputs(torch.autograd.Function):
 
 
 def _aligned(part: Tensor) -> Tensor:
-    """The same with the alignment that the optimizer's kernel asks for (16 bytes), which rows of a matrix may lack."""
+    """Return the tensor 16-byte aligned, as the optimizer's kernel needs; rows of a matrix may not be."""
     return part if part.data_ptr() % 16 == 0 else part.clone()

@@ -1,4 +1,4 @@
-"""`noisy_values` as one kernel each way, on the CPU."""
+"""Fast `noisy_values`: one CPU kernel each for forward and backward."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def fits(tables: Tables, mask_weights: Tensor | None) -> bool:
 def noisy_values(
     rows: Tensor, tables: Tables, mask_weights: Tensor | None, threshold: float, noise: Noise | None, drawn: Tensor
 ) -> NoisyValues:
-    """As `sw_anchors.noisy_values.noisy_values`."""
+    """Fast version of `sw_anchors.noisy_values.noisy_values`."""
     steps, uniform = (None, None) if noise is None else (noise.steps, noise.uniform)
     steps = steps[0] if steps is not None and len(steps) == 1 and len(rows) != 1 else steps
     return NoisyValues(*_Values.apply(rows, mask_weights, threshold, steps, uniform, drawn, *tables))  # type: ignore[no-untyped-call]

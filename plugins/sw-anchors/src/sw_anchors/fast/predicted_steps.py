@@ -1,4 +1,4 @@
-"""Quantiser steps that a context network predicts for all visible anchors: one node, a kernel on the CPU."""
+"""Predicted quantiser steps of all visible anchors as one autograd node, a kernel on the CPU."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Training steps of a `CodedAnchors` as CUDA graphs, in tensors of fixed sizes.
+"""Replay of `CodedAnchors` training steps as CUDA graphs, in tensors of fixed sizes.
 
 How many anchors a view sees differs from step to step. Here their rows are copied into tensors of a capacity, a few of
 which serve all views, and rows beyond the count are masked. So no shape depends on a value, and on a GPU the host
@@ -58,7 +58,7 @@ _REPLACED = ("visible_anchors", "decode", "attributes")
 
 
 def gaussians(model: Model, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
-    """As `CodedAnchors.gaussians`. A view that was drawn before is decoded before the host knows how many it sees."""
+    """Fast version of `CodedAnchors.gaussians`; decodes views seen before without waiting for the visible count."""
     decoder = DECODERS.get(model)
     if decoder is None:
         decoder = DECODERS[model] = FixedDecoder()
@@ -66,7 +66,7 @@ def gaussians(model: Model, camera: Camera, rasterizer: Rasterizer) -> GaussianI
 
 
 def release(model: Model) -> None:
-    """Forget the steps of a model, whose graphs hold memory."""
+    """Free a model's captured steps and their GPU memory."""
     DECODERS.pop(model, None)
 
 
@@ -80,10 +80,10 @@ class _Prepared:
 
 
 class FixedDecoder:
-    """Decodes one CodedAnchors in training. A step is prepared when its capacity is first asked for.
+    """Decodes one CodedAnchors in training; captures a step when its capacity is first needed.
 
-    All are prepared anew after a change of what decides the operators (plain values of the model and of its rate model)
-    or of a tensor of the model that does not belong to single anchors (a network was replaced). Growth changes neither.
+    All steps are captured again if a plain value of the model or its rate model changes, since it may select operators,
+    or if a tensor without anchor rows is replaced (such as a network weight). Growth changes neither.
 
     captures    how many steps were prepared, since this was made
     """
@@ -126,7 +126,7 @@ class FixedDecoder:
         return order, visible.index_select(0, order)
 
     def expected(self, camera: Camera, num_rows: int) -> int | None:
-        """Places for the anchors that this camera sees, of `num_rows`; None: not drawn before, or there are none.
+        """Return the expected capacity for this camera's anchors; None: camera not seen before, or none visible.
 
         A little more than it saw last: between two of its turns anchors grow, are pruned and change their size.
         """
@@ -136,7 +136,7 @@ class FixedDecoder:
         return capacity_of(min(math.ceil(seen * num_rows / of * CAPACITY_MARGIN), num_rows))
 
     def decode(self, model: Model, camera: Camera, rows: SeenRows) -> GaussianInputs | None:
-        """Decode the anchors `rows`: their Gaussians with opacity > 0; once more where not all had a place.
+        """Return Gaussians with opacity > 0 of the anchors `rows`; decode again if the capacity was too small.
 
         None where the GPU refused a graph or had no memory for it; that is said once.
         """
@@ -148,7 +148,7 @@ class FixedDecoder:
         return found
 
     def _decode(self, model: Model, camera: Camera, rows: SeenRows) -> GaussianInputs | None:
-        """As `decode`; None too where not all have a place."""
+        """Decode once; None if the capacity was too small."""
         if self._failed:
             return None
         parts = model.context_rows() if model.phase == ENTROPY else ()
@@ -242,7 +242,7 @@ class FixedDecoder:
         return 0 if held is None else len(held)
 
     def _drop(self) -> None:
-        """Forget all steps. Waits for the device, which may be at one."""
+        """Drop all captured steps. Waits for the device, which may be running one."""
         if self._steps and self._graphs:
             torch.cuda.synchronize()
         self._steps, self._shared, self._pool = {}, {}, None
@@ -252,7 +252,7 @@ DECODERS: WeakKeyDictionary[Any, FixedDecoder] = WeakKeyDictionary()
 
 
 def _plain_values(holder: object) -> list[Any]:
-    """Values of an object that decide which operators run: its numbers and words."""
+    """Return an object's numbers and strings, which decide the operators that run."""
     return [(name, value) for name, value in vars(holder).items() if _is_plain(value)]
 
 

@@ -1,4 +1,4 @@
-"""Rows of anchors in a training step: kernels copy them, put them back and add noise in one pass over memory, on CUDA.
+"""Gather, scatter and noise of anchor rows in a training step, each in one pass over memory on CUDA.
 
 Gradients are written into place: rows are taken once each, so nothing has to be summed (indexing a CUDA tensor sorts
 its index on the way back). Elsewhere the same by torch operations.
@@ -18,13 +18,13 @@ from sw_anchors.native import ANCHORS
 from sw_anchors.shape import AnchorShape
 from sw_codecs.quantizers.binary import SteMask
 
-MOST_TENSORS = 12
-"""Whose rows are copied together: `kTensors` of kernels/rows.h."""
+MAX_TENSORS = 12
+"""Largest number of tensors per launch: `kTensors` of kernels/rows.h."""
 
 
 def fit_kernels(*tensors: Tensor) -> bool:
-    """Whether there are kernels for these tensors, of 4 bytes a number on CUDA with rows without gaps; loads them."""
-    if not tensors or len(tensors) > MOST_TENSORS:
+    """Whether there are kernels for these tensors, on CUDA, 4 bytes per number, contiguous rows; loads them."""
+    if not tensors or len(tensors) > MAX_TENSORS:
         return False
     if not all(t.is_cuda and t.element_size() == 4 and t.dim() > 0 for t in tensors):
         return False
@@ -130,7 +130,7 @@ def noisy_rows(
 
 
 class _NoisyRows(torch.autograd.Function):
-    """`noisy_rows` by one kernel each way."""
+    """Autograd node of `noisy_rows`: one kernel each for forward and backward."""
 
     @staticmethod
     def forward(

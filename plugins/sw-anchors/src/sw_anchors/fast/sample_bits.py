@@ -1,4 +1,4 @@
-"""Bits of a sample of anchors under Gaussians by one kernel, which takes the derivatives on its way."""
+"""Bits of sampled anchors under Gaussians and their derivatives in one kernel."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def bits_of(
     smallest: float,
     smallest_scale: float,
 ) -> tuple[Tensor, Tensor]:
-    """As `rate_model.bits_of`; the derivative by the bits must not be negative."""
+    """Fast version of `rate_model.bits_of`; the incoming gradient must not be negative."""
     given = (values, mean, scale, steps, masks, counted)
     found: tuple[Tensor, Tensor] = _Bits.apply(*given, smallest, smallest_scale)  # type: ignore[no-untyped-call]
     return found

@@ -1,7 +1,6 @@
-"""Rows of the anchors that a view sees, in one form whether the host knows their number or not yet.
+"""Rows of visible anchors whose number the host may not know yet.
 
-Where a view was drawn before, about as many are expected as it saw last: so the host need not wait to learn how many
-there are before it starts their decoding.
+For a view rendered before, the last number serves as an estimate, so the host starts decoding without waiting.
 """
 
 from __future__ import annotations
@@ -9,12 +8,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-SMALLEST = 256
-"""Capacity of the views that see next to nothing."""
+MIN_CAPACITY = 256
+"""Smallest capacity."""
 
 
 class SeenRows:
-    """Rows of the anchors that are seen, all of them known to the host.
+    """Rows of the visible anchors, known to the host.
 
     loaded      [V] int64: what tensors of `capacity` rows are filled with; V < capacity
     capacity    one of a few sizes, which serve all views
@@ -25,19 +24,19 @@ class SeenRows:
         self.loaded, self.capacity = rows, capacity_of(len(rows))
 
     def write_number(self, to: Tensor) -> None:
-        """Write how many are seen into a scalar of their device. Waits for nothing."""
+        """Write the number of visible rows into a device scalar, without waiting."""
         to.fill_(len(self.loaded))
 
     def fit(self) -> bool:
-        """Whether all that are seen have a place, and one is left."""
+        """Whether all visible rows fit the capacity, with one to spare."""
         return True
 
     def placed(self) -> Tensor:
-        """[V] int64: those that have a place."""
+        """Visible rows within the capacity, [V] int64."""
         return self.loaded
 
     def known(self) -> Tensor:
-        """[V] int64: all that are seen."""
+        """All visible rows, [V] int64."""
         return self.loaded
 
 
@@ -75,20 +74,20 @@ class ExpectedRows(SeenRows):
         to.copy_(self._count)
 
     def fit(self) -> bool:
-        """As of SeenRows; waits as `number`."""
+        """Whether all visible rows fit, see SeenRows; waits like `number`."""
         return self.number() < self.capacity
 
     def placed(self) -> Tensor:
-        """As of SeenRows; waits as `number`."""
+        """Visible rows within the capacity, see SeenRows; waits like `number`."""
         return self.loaded[: self.number()]
 
     def known(self) -> Tensor:
-        """As of SeenRows; waits for the device."""
+        """All visible rows, see SeenRows; waits for the device."""
         return self._order[self._seen]
 
 
 def capacity_of(count: int) -> int:
-    """Rows of the tensors for `count` anchors: more than these, in four sizes an octave."""
-    size = max(count + 1, SMALLEST)
+    """Round `count` anchors up to a capacity, four sizes per octave."""
+    size = max(count + 1, MIN_CAPACITY)
     unit = 1 << (size.bit_length() - 3)
     return -(-size // unit) * unit

@@ -1,4 +1,4 @@
-"""Spawning of Gaussians by kernels: each is decoded, and its gradient taken, in one pass over memory.
+"""Kernels that spawn Gaussians: forward and backward take one pass over memory each.
 
 On the CPU networks and Gaussians are one kernel (`heads`); on CUDA, and where positions learn, networks are one node
 (`networks`), and the Gaussians with opacity > 0 another.
@@ -35,7 +35,7 @@ def spawn(
     masks: Tensor | None,
     networks: Networks,
 ) -> NeuralGaussians:
-    """As `neural_gaussians.spawn`. Waits for the device once, for the number of Gaussians."""
+    """Fast version of `neural_gaussians.spawn`. Waits for the device once, for the number of Gaussians."""
     if heads.fits(positions, networks):
         return heads.spawn(center, positions, features, offsets, scales, masks, networks)
     outputs = network_outputs(center, positions, features, networks)

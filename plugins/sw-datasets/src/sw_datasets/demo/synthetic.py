@@ -14,7 +14,7 @@ from torch import Tensor
 
 from splatwizard_core.api import Camera, PointCloud, Protocol, Scene, View, stream
 from sw_datasets.assemble import assemble_scene
-from sw_datasets.demo.kept import kept_or_drawn, picture_key
+from sw_datasets.demo.picture_cache import kept_or_drawn, picture_key
 from sw_datasets.demo.raycast import Solid, World, depth_map, draw, eye_of, normal_map
 from sw_datasets.demo.shapes import Box, Cylinder, Sphere, Torus, Vec, dot, rotation_x, rotation_z, uniform
 from sw_datasets.demo.textures import Material, bands, checker, dots, marble, planks

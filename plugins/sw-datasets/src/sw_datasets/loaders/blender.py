@@ -9,7 +9,7 @@ from pathlib import Path
 from splatwizard_core.api import PointCloud, Scene, SceneError, SceneOptions
 from sw_datasets.assemble import assemble_scene
 from sw_datasets.families import BLENDER
-from sw_datasets.gate import Gate
+from sw_datasets.image_checks import Gate
 from sw_datasets.loaders.transforms import Frames, read_frames, unused_keys
 from sw_datasets.rules import Rules, rules_for, unused_option_warnings
 from sw_datasets.start_points import cloud_beside, points_in_sight, random_points, read_cloud, share_in_sight

@@ -14,7 +14,7 @@ import torch
 from splatwizard_core.api import Camera, PointCloud, Scene, SceneError, SceneOptions
 from sw_datasets.assemble import assemble_scene
 from sw_datasets.families import COLMAP
-from sw_datasets.gate import Gate
+from sw_datasets.image_checks import Gate
 from sw_datasets.loaders.colmap_model import ColmapCamera, ColmapImage, ColmapPoints, count_images, read_model
 from sw_datasets.picture_names import SUFFIXES, find_pictures, list_pictures, name_key, view_name
 from sw_datasets.rules import Rules, rules_for, unused_option_warnings

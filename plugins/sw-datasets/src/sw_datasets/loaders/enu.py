@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from splatwizard_core.api import Camera, Scene, SceneError, SceneOptions
 from splatwizard_native import json_reason
 from sw_datasets.assemble import assemble_scene
-from sw_datasets.gate import Gate
+from sw_datasets.image_checks import Gate
 from sw_datasets.loaders.transforms import unused_keys
 from sw_datasets.picture_names import list_pictures
 from sw_datasets.rules import Rules, unused_option_warnings

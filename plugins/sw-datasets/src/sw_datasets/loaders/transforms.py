@@ -22,7 +22,7 @@ from splatwizard_core.api import Camera, PointCloud, Scene, SceneError, SceneOpt
 from splatwizard_native import json_reason
 from sw_datasets.assemble import assemble_scene
 from sw_datasets.families import TRANSFORMS
-from sw_datasets.gate import Gate
+from sw_datasets.image_checks import Gate
 from sw_datasets.loaders.colmap import idle_masks, mask_files
 from sw_datasets.name_lists import NameLists
 from sw_datasets.picture_names import SUFFIXES, find_each, find_pictures, is_inside, view_name

@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from splatwizard_core.training.density import DensityReport, DensityTask
 
 SPLIT_CHILDREN = 2
-"""Scales of the children of a split are divided by this."""
+"""Factor that divides the scales of the two children of a split."""
 
 
 class GradientSettings(Params):
-    """Settings of a control that grows by screen-space gradients and lowers opacities now and then."""
+    """Shared settings of controls that densify by screen-space gradients and reset opacities."""
 
     start: int = Field(500, ge=0, description="first step that densifies (authors' code: 600)")
     stop: int = Field(15_000, ge=0, description="no densification, statistics or opacity reset from this step on")
@@ -56,7 +56,7 @@ class AdaptiveSettings(GradientSettings):
 
 
 class AdaptiveDensityControl(DensityControl):
-    """Statistics at each step, densification every 100, an opacity reset every 3,000, until half time."""
+    """3DGS density control until half time: densification every 100 steps, opacity reset every 3,000."""
 
     Settings: ClassVar[type[GradientSettings]] = AdaptiveSettings
     white = False  # known when a training begins; a plan can be printed without a scene
@@ -85,7 +85,7 @@ class AdaptiveDensityControl(DensityControl):
         yield from self.resets()
 
     def resets(self) -> Iterable[DensityTask]:
-        """Return when opacities are reset."""
+        """Return the steps at which opacities are reset."""
         settings = self.settings
         if self.white and 0 < settings.white_reset < settings.stop:
             # Against white, faint Gaussians in empty space cost nothing at first and hide the object later.
@@ -115,13 +115,13 @@ class AdaptiveDensityControl(DensityControl):
         )
 
     def steps(self, steps: int) -> int:
-        """Return a number of steps of the full run in steps of this one."""
+        """Scale a step count of the full schedule to this, possibly shortened, run."""
         found = self.when(steps)
         assert isinstance(found, int)
         return found
 
     def min_opacity(self, lr: float) -> float:
-        """Return the opacity below which Gaussians are pruned: one that they can reach again after a reset.
+        """Return the opacity below which Gaussians are pruned, low enough to be exceeded again after a reset.
 
         lr      step size of the opacity logits
 
@@ -151,7 +151,7 @@ def densify_and_prune(
     prune_screen_px: float | None = None,
     revised_opacity: bool = False,
 ) -> dict[str, int]:
-    """Clone small, split large Gaussians whose mean screen-space gradient is high; prune faint and huge ones.
+    """Clone small and split large Gaussians with a high mean screen-space gradient; prune transparent and huge ones.
 
     extent              E, world units: scale of the two size thresholds
     grad_threshold      NDC units per view (`>=`)
@@ -207,5 +207,5 @@ def densify_and_prune(
 
 @torch.no_grad()
 def reset_opacity(model: GaussianModel, rows: SplatOptimizer, *, ceiling: float = 0.01) -> None:
-    """Lower every opacity to at most `ceiling`; the Adam moments of the opacities become zero, their step stays."""
+    """Clamp every opacity to at most `ceiling`; zero the Adam moments of the opacities, keep their step counter."""
     rows.replace(model, "opacity_logits", model.opacity_logits.detach().clamp_max(logit(ceiling)))

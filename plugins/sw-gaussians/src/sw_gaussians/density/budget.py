@@ -1,4 +1,4 @@
-"""Density control with a budget: which Gaussians get company is drawn by a score, how many follows from two bounds.
+"""Density control with a budget: Gaussians to densify are sampled by a score, their number has two upper bounds.
 
 Sources: LiteGS (arXiv 2503.01199) for the draw without a threshold, the children and the halving; the bound by what
 plain density control would do is our own.
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from splatwizard_core.training.density import DensityReport, DensityTask
 
 CHILD_SHRINK = 1.6
-"""Scales of a child of a large Gaussian are divided by this, as those of two children are in 3DGS."""
+"""Factor that divides the scales of a split Gaussian's child, as in 3DGS."""
 OPACITY_FLOOR = 1 / 128
-"""Opacity that halving leaves at least."""
+"""Smallest opacity after halving."""
 SCORES = ("opacity_variance", "gradient")
-"""By what the draw is weighted."""
+"""Scores that may weight the sampling."""
 
 
 Score = Literal["opacity_variance", "gradient"]
@@ -53,13 +53,13 @@ class BudgetSettings(GradientSettings):
 
 
 class BudgetControl(AdaptiveDensityControl):
-    """The plan of adaptive density control; a draw decides who gets company, and opacities may be halved instead."""
+    """Schedule of adaptive density control; samples which Gaussians to densify, may halve opacities, not reset."""
 
     Settings: ClassVar[type[GradientSettings]] = BudgetSettings
 
     @property
     def by_variance(self) -> bool:
-        """Whether the score is that of opacity gradients over fragments."""
+        """Whether the score is the variance of opacity gradients."""
         return bool(self.settings.score == "opacity_variance")
 
     def needs(self, step: int) -> frozenset[str]:
@@ -140,7 +140,7 @@ def draw_distinct(weights: Tensor, count: int, generator: torch.Generator) -> Te
 
 
 def linear_target(step: int, *, first: int, last: int, start: int, cap: int) -> int:
-    """Return how many Gaussians there should be at a step: from `start` at `first` to `cap` at `last`, linearly."""
+    """Return the target number of Gaussians at a step: linear from `start` at `first` to `cap` at `last`."""
     share = 1.0 if step >= last else 0.0 if step <= first else (step - first) / (last - first)
     return int(start + (max(cap, start) - start) * share)
 
@@ -161,7 +161,7 @@ def densify_to_budget(
     prune_unused: bool = True,
     morton: bool = False,
 ) -> dict[str, int]:
-    """Prune what is not needed, and give as many Gaussians a neighbour as the budget and the evidence allow.
+    """Prune, then clone or split as many Gaussians as the budget and the gradient statistics allow.
 
     extent          E, world units: scale of `percent_dense`
     target          Gaussians that there should be now; one more than are pruned may come where it is reached
@@ -222,7 +222,7 @@ def densify_to_budget(
 
 @torch.no_grad()
 def halve_opacity(model: GaussianModel, rows: SplatOptimizer, *, floor: float = OPACITY_FLOOR) -> None:
-    """Set every opacity o to max(o / 2, floor), and let Adam start afresh for all parameters.
+    """Set every opacity o to max(o / 2, floor), and reset Adam's state of all parameters.
 
     With its moments the step counters go too: kept, the first step after would be 3.2 times the learning rate.
     Source: LiteGS (arXiv 2503.01199).

@@ -1,4 +1,4 @@
-"""Keys with which a user chooses a density control."""
+"""Configuration block that chooses a density control by name."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class DensityChoice(Choice):
-    """Density control: how Gaussians come and go while they train."""
+    """Density control, by name, and its settings."""
 
     REGISTRY: ClassVar[str] = "density_controls"
 
@@ -29,7 +29,7 @@ class DensityChoice(Choice):
         return control
 
     def usual(self) -> DensityControl:
-        """Return that of 3DGS, for a stage whose method hands none on; raise PluginError if another one is chosen."""
+        """Return the control of 3DGS, for a stage that was given none. Raises PluginError if another one is chosen."""
         if self.name != "adc":
             raise PluginError(
                 f"density={self.name} does not reach the training: the author of its method has to make the stage with "

@@ -1,4 +1,4 @@
-"""Statistics of opacity gradients over fragments: where a Gaussian's pixels disagree about how opaque it should be."""
+"""Variance of opacity gradients over fragments: high where pixels disagree about a Gaussian's opacity."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from sw_gaussians.fast import statistics as fast
 
 BUFFER = "fragments"
 """Buffer [N,3] of a model: sum of g, sum of g^2, number of fragments, with g = o dL/do of one pixel of one view."""
-LEAST_CLEAR = 1e-6
-"""Floor of 1 - opacity where the derivative by the logit is turned into that by the opacity."""
+MIN_TRANSPARENCY = 1e-6
+"""Floor of 1 - opacity when converting d/d logit to d/d opacity."""
 
 
 def add_buffer(model: GaussianModel) -> None:
-    """Give a model the buffer, zero, as one of its rows: it follows them wherever they go, and into checkpoints."""
+    """Add the zero-filled buffer to the model; its rows follow the Gaussians and are saved in checkpoints."""
     if BUFFER not in model.ROWS:
         model.register_buffer(BUFFER, model.means.new_zeros(model.num_rows, 3))
         model.ROWS = (*model.ROWS, BUFFER)
@@ -30,7 +30,7 @@ def drop_buffer(model: SplatModel) -> None:
 
 @torch.no_grad()
 def opacity_variance(fragments: Tensor) -> Tensor:
-    """Score Gaussians by the variance of the gradient by their opacity, times its square and the fragments.
+    """Score Gaussians by opacity^2 times the number of fragments times the variance of the opacity gradient.
 
     fragments   [N,3] as `BUFFER`
 
@@ -66,12 +66,12 @@ def accumulate_fragments(sums: Tensor, gradients: Tensor, logits: Tensor, fragme
     gradients   [N] derivative of the loss by the logits [N] of the opacities
     fragments   [N,2] sum of g^2, and number of fragments (RenderResult.fragment_grad)
     """
-    if not fast.accumulate_fragments(sums, gradients, logits, fragments, least_clear=LEAST_CLEAR):
+    if not fast.accumulate_fragments(sums, gradients, logits, fragments, least_clear=MIN_TRANSPARENCY):
         accumulate_fragments_in_torch(sums, gradients, logits, fragments)
 
 
 def accumulate_fragments_in_torch(sums: Tensor, gradients: Tensor, logits: Tensor, fragments: Tensor) -> None:
-    """Do what `accumulate_fragments` does, without a kernel."""
-    clear = (1 - torch.sigmoid(logits)).clamp_min_(LEAST_CLEAR)
+    """Plain-torch version of `accumulate_fragments`."""
+    clear = (1 - torch.sigmoid(logits)).clamp_min_(MIN_TRANSPARENCY)
     sums[:, 0].addcdiv_(gradients, clear)  # do/dlogit = o (1 - o)
     sums[:, 1:].add_(fragments)

@@ -1,8 +1,7 @@
-"""Density control as Markov chain Monte Carlo: dead Gaussians move to live ones, a few more join them, all are shaken.
+"""Density control of 3DGS-MCMC: relocate dead Gaussians onto live ones, add new ones, add noise to positions.
 
-Every draw comes from a stream that is named after the step, so there is no state to save: a run that resumes at a step
-draws what the uninterrupted one drew there.
-Source: 3D Gaussian Splatting as Markov Chain Monte Carlo (arXiv 2404.09591).
+Random numbers come from a stream per step, so there is no generator state to save: a resumed run draws the same
+numbers. Source: 3D Gaussian Splatting as Markov Chain Monte Carlo (arXiv 2404.09591).
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
     from splatwizard_core.training.density import DensityReport, DensityTask
 
 MAX_COPIES = 51
-"""More copies of one Gaussian than this are treated as this many (the paper's code has binomials up to there)."""
+"""Largest number of copies per Gaussian in the relocation formula (size of the binomial table in the paper's code)."""
 STEEPNESS = 100.0
 """Steepness of the logistic that turns the noise off as a Gaussian becomes opaque."""
 
@@ -46,7 +45,7 @@ class MCMCSettings(Params):
 
 
 class MCMC(DensityControl):
-    """Relocation and growth every 100 steps; noise at each step; opacities and scales are part of the loss."""
+    """3DGS-MCMC: relocation and growth every 100 steps, noise per step, opacity and scale regularisers."""
 
     Settings = MCMCSettings
     regularises = True
@@ -97,7 +96,7 @@ class MCMC(DensityControl):
         return {"added": added}
 
     def regularised(self, loss: LossPack, result: RenderResult, step: int) -> LossPack:
-        """Add what makes Gaussians fade and shrink unless a picture needs them, so that they can be relocated."""
+        """Add the opacity and scale regularisers, which turn unneeded Gaussians into dead ones."""
         settings, inputs = self.settings, result.inputs
         if inputs.scales is None:
             raise TypeError("density=mcmc needs a model with scales: that of 3dgs has them")
@@ -107,7 +106,7 @@ class MCMC(DensityControl):
 
 
 def gaussians_of(state: TrainingState) -> GaussianModel:
-    """Return the model, which `begin` has let pass."""
+    """Return the model as a GaussianModel; `begin` has checked its type."""
     assert isinstance(state.model, GaussianModel)
     return state.model
 
@@ -124,7 +123,7 @@ def _coefficients() -> Tensor:
 
 @torch.no_grad()
 def shared_among(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
-    """Opacity and scales of `copies` equal Gaussians in one place that together look like the one given.
+    """Return opacity and scales of `copies` coincident Gaussians that together render like the given one.
 
     opacities   [M] in 0..1
     scales      [M,3] > 0, standard deviations
@@ -148,7 +147,7 @@ def shared_among(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Ten
 
 
 def draw(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """[count] int64: rows drawn with replacement, with probabilities proportional to `weights` [N] >= 0.
+    """Return rows [count] int64, sampled with replacement in proportion to `weights` [N] >= 0.
 
     The random numbers are drawn on the CPU, so that every device draws the same rows.
     """
@@ -164,12 +163,12 @@ def draw(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
 def relocate(
     model: GaussianModel, rows: SplatOptimizer, generator: torch.Generator, *, min_opacity: float = 0.005
 ) -> int:
-    """Move every Gaussian with an opacity of at most `min_opacity` onto a live one; how many moved.
+    """Move every Gaussian with opacity <= `min_opacity` onto a live one; return how many moved.
 
-    The live ones are drawn in proportion to their opacity, and each shares its opacity and scales with those that come
-    (`shared_among`). Adam moments of the sources become zero, the moved ones keep theirs: with a second moment of zero
-    the tiny gradients of the regularisers make steps of several learning rates for as long as no view shows a
-    Gaussian, so that it dies again. If none is dead, or none is alive, nothing happens.
+    Targets are sampled in proportion to opacity; each shares its opacity and scales with its arrivals (`shared_among`).
+    Adam moments of the targets become zero, those of moved Gaussians stay. With a second moment of zero, the tiny
+    gradients of the regularisers would make steps of several learning rates until a view shows the Gaussian, so that
+    it dies again. If none is dead, or none is alive, nothing happens.
     """
     opacities = model.opacities
     is_dead = opacities <= min_opacity
@@ -197,7 +196,7 @@ def grow(
     growth: float = 0.05,
     min_opacity: float = 0.005,
 ) -> int:
-    """Add copies of Gaussians drawn in proportion to opacity, up to min(cap, floor((1 + growth) N)); how many.
+    """Copy Gaussians sampled by opacity until there are min(cap, floor((1 + growth) N)); return how many were added.
 
     Each copied one shares its opacity and scales with its copies and keeps its Adam moments, those of the copies are
     zero. A model that is larger than the cap stays as it is.

@@ -1,4 +1,4 @@
-"""Children of Gaussians: drawn from the Gaussian that they come of, and smaller."""
+"""Children of split Gaussians: positions sampled from the parent, scales reduced."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from splatwizard_core.api import GaussianModel
 def split_children(
     model: GaussianModel, parents: Tensor, count: int, *, shrink: float | None = None
 ) -> dict[str, Tensor]:
-    """Rows of `count` children of each of `parents` [P]: all first children, all second, ...; tensors [count P, ...].
+    """Return `count` children per parent [P], tensors [count P, ...]: all first children, then all second, ...
 
-    A child lies at centre + R (scales * z) with z from the model's stream of splits, has the parent's scales divided
-    by `shrink` (None: 0.8 count), and the rest unchanged; those of a surfel, of two scales, stay in its plane.
+    A child's position is centre + R (scales * z), z ~ N(0, I) from the model's stream of splits. Its scales are the
+    parent's divided by `shrink` (None: 0.8 count); all else is copied. Children of a surfel stay in its plane.
     """
     rows = {
         name: parameter.detach()[parents].repeat(count, *[1] * (parameter.dim() - 1))
@@ -32,7 +32,7 @@ def split_children(
 
 
 def rotate(quats: Tensor, vectors: Tensor) -> Tensor:
-    """Vectors [N,3] turned by quaternions [N,4] (w,x,y,z), any norm."""
+    """Rotate vectors [N,3] by quaternions [N,4] (w,x,y,z) of any norm."""
     unit = torch.nn.functional.normalize(quats, dim=1, eps=1e-12)
     w, axis = unit[:, :1], unit[:, 1:]
     turned = 2 * torch.linalg.cross(axis, vectors)

@@ -1,1 +1,1 @@
-"""Faster ways to the same result: delete this folder, and what chooses them takes the plain functions."""
+"""Faster versions of plain functions, same signatures; callers fall back to the plain ones without this folder."""

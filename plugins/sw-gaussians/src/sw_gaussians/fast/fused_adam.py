@@ -1,4 +1,4 @@
-"""Adam whose step of the spherical harmonics a rasterizer may do in its backward pass; dense, as always."""
+"""Dense Adam whose update of the spherical harmonics may run inside the rasterizer's backward pass."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from sw_gaussians.control_tasks import Collect
 if TYPE_CHECKING:
     from splatwizard_core.api import RenderResult, Scheduler
 
-FUSED_FROM = 200_000
-"""Gaussians from which updates in the backward pass save time: of 185,000 a step takes as long, of a million 0.91."""
+MIN_FUSED_GAUSSIANS = 200_000
+"""Smallest number of Gaussians to fuse: step time is equal at 185,000 and 0.91 times at one million."""
 OFFERED = ("sh_dc", "sh_rest")
-"""48 of the 59 numbers of a Gaussian, drawn as they are stored: no activation stands between them and the kernel."""
+"""Parameters that may be fused: no activation between storage and kernel; 48 of a Gaussian's 59 numbers."""
 
 
 class FusingOptimizer(SplatOptimizer):
-    """Dense Adam. `offer` before a drawing saves writing and reading the gradients of spherical harmonics.
+    """Dense Adam; `offer` before a render avoids writing and reading gradients of spherical harmonics.
 
     Source: Faster-GS (arXiv 2602.09999), whose fused backward pass and optimizer do so for all parameters.
     """
@@ -30,7 +30,7 @@ class FusingOptimizer(SplatOptimizer):
     _waiting: tuple[tuple[str, Tensor], ...] = ()
 
     def offer(self) -> None:
-        """Let the coming backward pass do this step's updates; only where one drawing makes the whole gradient."""
+        """Let the next backward pass do this step's updates; valid only if one render gives the whole gradient."""
         params = [(name, getattr(self.model, name)) for name in OFFERED]
         fit = [name for name, p in params if p.is_cuda and p.dtype == torch.float32 and p.is_contiguous()]
         self._offer_all([name for name in fit if name in self.states])  # moments exist from the first update on
@@ -49,7 +49,7 @@ class FusingOptimizer(SplatOptimizer):
         self._waiting = tuple(waiting)
 
     def step(self, result: RenderResult | None = None) -> None:
-        """Update every parameter that has a gradient; what the backward pass has done is counted."""
+        """Update every parameter with a gradient that the backward pass has not updated; count its updates."""
         for name, param in self._waiting:
             if not end_offer(param) and param.grad is None:  # with a gradient it is done, and counted, below
                 self.states[name].step += 1
@@ -60,15 +60,15 @@ class FusingOptimizer(SplatOptimizer):
 def offer_updates(
     optimizer: SplatOptimizer | None, post: Scheduler | None, step: int, *, before: int, forced: bool
 ) -> None:
-    """Offer the updates of a step to its backward pass, if no task but those that collect sees gradients.
+    """Fuse the updates into the backward pass unless a task other than statistics reads gradients.
 
     post    tasks of the stage
     before  steps from here on make no update
-    forced  also below `FUSED_FROM` Gaussians
+    forced  also below `MIN_FUSED_GAUSSIANS` Gaussians
     """
     if not isinstance(optimizer, FusingOptimizer) or post is None:
         return
-    if not forced and optimizer.model.num_rows < FUSED_FROM:
+    if not forced and optimizer.model.num_rows < MIN_FUSED_GAUSSIANS:
         return
     due = (entry.task for entry in post.registrations if entry.due(step))
     if step < before and torch.is_grad_enabled() and all(isinstance(task, Collect) for task in due):

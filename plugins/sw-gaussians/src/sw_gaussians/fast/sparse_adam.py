@@ -1,4 +1,4 @@
-"""Compiled kernels of sparse Adam: one update on the CPU, all in one launch on CUDA, where hidden rows are not read."""
+"""Compiled sparse Adam: one call per parameter on the CPU, one launch for all parameters on CUDA."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sw_gaussians.native import GAUSSIANS
 
 
 def left_of(updates: Sequence[AdamUpdate], rows: Tensor) -> list[AdamUpdate]:
-    """Do the updates that a kernel knows, of the marked rows [N] bool; return the others."""
+    """Run the updates that a kernel supports, for the marked rows [N] bool; return the others."""
     left = list(updates)
     if updates and rows.is_cuda and GAUSSIANS.has_cuda():
         nothing = rows.new_empty(0, dtype=torch.int32)
@@ -40,6 +40,6 @@ def _on_the_cpu(u: AdamUpdate, rows: Tensor) -> bool:
 
 
 def _written(u: AdamUpdate) -> None:
-    """Tell autograd of what a kernel has written behind its back."""
+    """Bump autograd's version counters of tensors that a kernel has written."""
     for tensor in (u.param, u.exp_avg, u.exp_avg_sq):
         torch.autograd.graph.increment_version(tensor)

@@ -1,4 +1,4 @@
-"""Statistics of a view in one launch on CUDA: the same sums, to the last bit of a root."""
+"""Per-view gradient statistics in one CUDA launch; sums equal to the plain ones up to rounding of the square root."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Stages of Splatwizard methods that start from a trained scene: prune, fine-tune, distil."""
+"""Stages that start from a trained scene: pruning, fine-tuning, distillation."""

@@ -1,4 +1,4 @@
-"""Learning from a frozen teacher instead of photographs: from its renders, also at poses without a photograph.
+"""Distillation: a student learns from renders of a frozen teacher, also at poses without a photograph.
 
 Source: LightGaussian (arXiv 2311.17245), distillation with pseudo views.
 """
@@ -29,7 +29,7 @@ DistillLoss = Literal["l1_ssim", "l2"]
 
 
 class PseudoViewSampler(CameraSampler):
-    """Training poses, most of them moved a little: those are views without a picture, for a teacher to draw.
+    """Samples training poses, most with a small random offset, for the teacher to render.
 
     std     standard deviation of the camera centre's displacement along each axis, world units
     every   each `every`-th step keeps the training view as it is, the others move it; 1: none is moved
@@ -55,7 +55,7 @@ class PseudoViewSampler(CameraSampler):
 def distillation_loss(
     image: Tensor, target: Tensor, kind: DistillLoss = "l1_ssim", lambda_dssim: float = 0.2
 ) -> LossPack:
-    """Distance of a student's render from its teacher's.
+    """Return the loss between the student's and the teacher's render.
 
     image, target   [3,H,W]; `target` without gradient
     kind            "l1_ssim": the 3DGS loss between the two; "l2": their mean squared difference
@@ -68,7 +68,7 @@ def distillation_loss(
 
 
 class DistillationStage(FineTuningStage):
-    """Goes on from the stage before, taught by a trained scene; no photograph is looked at.
+    """Continues the previous stage with a trained scene as teacher; uses no photographs.
 
     rates           step sizes of the student
     distill_loss    see `distillation_loss`
@@ -94,7 +94,7 @@ class DistillationStage(FineTuningStage):
         self.pseudo_view_std, self.pseudo_view_every = pseudo_view_std, pseudo_view_every
 
     def find_teacher(self, context: StageContext) -> SplatModel:
-        """Return the frozen model that teaches: the trained scene of `taught_by`, which a subclass names.
+        """Return the frozen teacher: the trained scene of the method in `taught_by`, which a subclass sets.
 
         Override it for a teacher that is no method's trained scene. It must be the same on resume: made from
         `context.trained(...)`, or a copy of `context.model`, which is what the stage before left.
@@ -111,7 +111,7 @@ class DistillationStage(FineTuningStage):
 
     @torch.no_grad()
     def teach(self, view: View, background: Tensor) -> Tensor:
-        """[3,H,W], the teacher's render: with its own SH degree, on the background that the student is drawn on."""
+        """Return the teacher's render [3,H,W], at its own SH degree, on the student's background."""
         camera = view.camera.to(background.device)
         drawn = self.teacher.gaussians(camera, self._rasterizer)
         image = self._rasterizer.render(drawn, camera, RasterOptions(background=background)).image

@@ -1,4 +1,4 @@
-"""Training on from a trained scene of Gaussians without densification, as pruning methods do between removals."""
+"""Fine-tuning of trained Gaussians without densification, as pruning methods do between removals."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class FineTuningRates(Params):
     decay_interval: int = Field(400, ge=1, description="steps between two of these factors")
 
     def of_step(self, step: float, extent: float) -> dict[str, float]:
-        """Rate by parameter group at `step`, counted from where the decays begin; that of the means in world units."""
+        """Return the rate per parameter group; `step` counts from the start of the decay. Means: world units."""
         factor = self.decay ** (int(step + 1e-9) // self.decay_interval)
         means = exponential_lr(
             self.position_offset + step,
@@ -64,7 +64,7 @@ class FineTuningRates(Params):
 
 
 class UpdateRates:
-    """Schedule task: the step sizes of all groups of the optimizer that `rates` knows.
+    """Schedule task: set the learning rate of each optimizer group named in `rates`.
 
     starts      steps at which the decays begin anew (a method of several rounds), ascending, the first 1
     scale       of the plan: steps of the full run are 1 / scale of this run's
@@ -81,9 +81,9 @@ class UpdateRates:
 
 
 def windows_before(removals: Iterable[int], length: int) -> list[range]:
-    """The steps over which gradients are averaged for each of `removals` (steps, ascending): the `length` before it.
+    """Return per removal (steps, ascending) the range of `length` steps before it, over which gradients are averaged.
 
-    No window reaches behind the removal before. Of removals in successive steps each has the gradients of its own step,
+    No window starts before the previous removal. A removal right after another one uses the gradients of its own step,
     which are collected first.
     """
     steps = list(removals)
@@ -91,7 +91,7 @@ def windows_before(removals: Iterable[int], length: int) -> list[range]:
 
 
 def collect_anew(scheduler: Scheduler, windows: Sequence[range]) -> None:
-    """Post tasks that add gradients up over each of the `windows`, every time from zero."""
+    """Register post tasks that accumulate gradient statistics over each of the `windows`, starting from zero."""
     starts = [window.start for window in windows]
     scheduler.register_task(starts, clear_statistics, priority=CLEAR, name="clear gradient statistics")
     steps = [step for window in windows for step in window]
@@ -99,7 +99,7 @@ def collect_anew(scheduler: Scheduler, windows: Sequence[range]) -> None:
 
 
 class FineTuningStage(Stage):
-    """Goes on from trained Gaussians: all SH bands active, fresh Adam, L1 + SSIM, nothing added.
+    """Fine-tunes trained Gaussians: all SH bands active, new Adam state, L1 + SSIM, no densification.
 
     A method subclasses it, says in `starts_from` whose trained scene that is, and registers in `register_post_task`
     what removes Gaussians.
@@ -138,7 +138,7 @@ class FineTuningStage(Stage):
         scheduler.register_task(lasting, update, name="update lr")
 
     def round_starts(self) -> Sequence[int]:
-        """Steps of this run at which the decays of the rates begin anew."""
+        """Steps of this run at which the learning-rate decay restarts."""
         return (1,)
 
     def raster_options(self, step: int, background: Tensor) -> RasterOptions:

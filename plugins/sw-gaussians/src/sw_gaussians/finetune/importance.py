@@ -1,4 +1,4 @@
-"""Gaussians that keep a score each, for a file that spends its bytes on those that matter."""
+"""Gaussians with an importance score each, for codecs that spend more bits on important ones."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from sw_gaussians.finetune.pruning import scores_of
 
 
 class ScoredGaussians(GaussianModel):
-    """Gaussians and how much each one matters.
+    """Gaussians with an importance score per row.
 
     importance  [N] buffer, higher = more important; zeros until `set_importance`
     """
@@ -25,12 +25,12 @@ class ScoredGaussians(GaussianModel):
 
     @torch.no_grad()
     def set_importance(self, scores: Tensor) -> None:
-        """Keep the scores [N] of a pruner; those below 0, and -inf for what no view shows, become 0."""
+        """Store a pruner's scores [N]; negative ones, and -inf of Gaussians no view shows, become 0."""
         self.importance.copy_(scores.clamp_min(0))
 
 
 class KeepImportance:
-    """Schedule task: score every Gaussian over the training views and let the model keep the scores.
+    """Schedule task: score every Gaussian over the training views and store the scores in the model.
 
     At the last step of a stage, which makes no update, the scores are those of the parameters that are encoded.
     """

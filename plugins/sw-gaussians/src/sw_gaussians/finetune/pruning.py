@@ -1,4 +1,4 @@
-"""Pruning by score: how many primitives go, and which, by the scores of a pruner that any plugin may provide."""
+"""Pruning by score: remove a share of the primitives by the scores of any registered pruner."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CountRule = Literal["exact", "official"]
 
 
 def removal_count(n: int, fraction: float) -> int:
-    """Number of n primitives that a removal of `fraction` (0..1) takes: floor(fraction n), safe from binary fractions.
+    """Return floor(fraction n), the number of primitives to remove, robust to binary rounding of `fraction` (0..1).
 
     0.3 of 10 is 3, though 0.3 * 10 may come out below 3 in floating point.
     """
@@ -33,7 +33,7 @@ def removal_count(n: int, fraction: float) -> int:
 
 
 def lowest(scores: Tensor, count: int) -> Tensor:
-    """[N] bool, True for the `count` lowest of `scores` [N]; of equal ones the first rows go. -inf is the lowest.
+    """Return [N] bool, True for the `count` lowest `scores` [N]; ties go to the first rows. -inf is the lowest.
 
     Raises ValueError for NaN.
     """
@@ -46,7 +46,7 @@ def lowest(scores: Tensor, count: int) -> Tensor:
 
 
 def up_to(scores: Tensor, fraction: float) -> Tensor:
-    """[N] bool, True for at most the score at index int(fraction (N - 1)) of the sorted `scores` [N].
+    """Return [N] bool: True where a score is at most the one at index int(fraction (N - 1)) of the sorted `scores` [N].
 
     How the authors of PUP 3D-GS and of LightGaussian count: one more than the fraction, and all of many equal ones
     (those that no view shows).
@@ -57,7 +57,7 @@ def up_to(scores: Tensor, fraction: float) -> Tensor:
 
 
 class PruneByScore:
-    """Schedule task: scores every primitive over the training views and removes the lowest; says how many ("pruned").
+    """Schedule task: score every primitive over the training views and remove the lowest; curve "pruned".
 
     pruner      whose scores
     fractions   share that goes, 0..1: of the count at that step. A number, or step -> number
@@ -105,7 +105,7 @@ class PruneByScore:
 def scores_of(
     pruner: Pruner, model: SplatModel, cameras: CameraIterator, rasterizer: Rasterizer, scene: Scene
 ) -> Tensor:
-    """[N], one score a row of the model, on the background that the scene is evaluated on.
+    """Return one score per row of the model, [N], rendered on the evaluation background.
 
     Raises ShapeError or ValueError for what cannot be scores.
     """

@@ -1,4 +1,4 @@
-"""Volume of a Gaussian, as it counts in scores of what it contributes to the pictures.
+"""Volume factor of pruning scores.
 
 Source: LightGaussian (arXiv 2311.17245); MesonGS (arXiv 2409.09756).
 """

@@ -39,7 +39,7 @@ LIMITS = {"num_offsets": 64, "feature_dim": 256, "hidden": 256}
 class TestAnchorsConfig(OptimizationParams):
     iterations: int = Field(50, ge=1, description="steps")
     voxel_size: float = Field(0.08, gt=0, description="edge of an anchor's cell, world units")
-    num_offsets: int = Field(4, ge=1, le=LIMITS["num_offsets"], description="Gaussians an anchor can spawn")
+    num_offsets: int = Field(4, ge=1, le=LIMITS["num_offsets"], description="Gaussians per anchor")
     feature_dim: int = Field(8, ge=1, le=LIMITS["feature_dim"], description="numbers in an anchor's feature")
     hidden: int = Field(24, ge=1, le=LIMITS["hidden"], description="width of the networks")
     feature_step: float = Field(0.02, gt=0, description="quantiser step of the features")

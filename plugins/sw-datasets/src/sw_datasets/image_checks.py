@@ -1,4 +1,4 @@
-"""The gate that the pictures of every scene pass: size against camera, EXIF turns, alpha and masks.
+"""Checks that the pictures of every scene pass: size against camera, EXIF turns, alpha and masks.
 
 A loader asks it for each view; what was found stands in `warnings` once all views are made.
 """
@@ -23,11 +23,11 @@ from sw_datasets.pictures import (
 )
 from sw_datasets.rules import Rules
 
-STRETCH = 0.01
+MAX_ASPECT_ERROR = 0.01
 """Share by which the scales of a picture in x and y may differ, beyond rounding to whole pixels, and be but told."""
-FAR_OFF = 0.25
+MAX_CENTER_OFFSET = 0.25
 """Share of the picture's side by which a principal point off the centre is told whatever the rules say."""
-SIDEWAYS = range(5, 9)
+ROTATED_90 = range(5, 9)
 """EXIF orientations that swap width and height."""
 
 
@@ -87,7 +87,7 @@ class Gate:
             return said
         (w, h), (cw, ch) = stored, camera_size
         stretch = abs((w / cw) / (h / ch) - 1)
-        if stretch <= STRETCH:
+        if stretch <= MAX_ASPECT_ERROR:
             self.seen["stretched"] += 1
             if stretch > self._unlike[0]:
                 self._unlike = stretch, f"'{name}' is {w}x{h} px, its camera {cw}x{ch}"
@@ -112,7 +112,10 @@ class Gate:
         size = fitted_size(picture.width, picture.height, rules.resolution)
         off = max(abs(camera.cx - camera.width / 2), abs(camera.cy - camera.height / 2))
         self.off_centre = max(self.off_centre, off)
-        if abs(camera.cx / camera.width - 0.5) > FAR_OFF or abs(camera.cy / camera.height - 0.5) > FAR_OFF:
+        if (
+            abs(camera.cx / camera.width - 0.5) > MAX_CENTER_OFFSET
+            or abs(camera.cy / camera.height - 0.5) > MAX_CENTER_OFFSET
+        ):
             self._far_off = self._far_off or name
         if rules.principal_point != "file":
             camera = _centred(camera)
@@ -221,7 +224,7 @@ def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
 
 
 def _turned(header: Header, turn: int) -> tuple[int, int]:
-    return (header.height, header.width) if turn in SIDEWAYS else (header.width, header.height)
+    return (header.height, header.width) if turn in ROTATED_90 else (header.width, header.height)
 
 
 def _centred(camera: Camera) -> Camera:

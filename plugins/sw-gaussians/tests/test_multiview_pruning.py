@@ -4,8 +4,8 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from sw_gaussians.blame import badly_drawn, blame_of_views, draw_views, guilt
 from sw_gaussians.fast_tasks import PruneByViews
+from sw_gaussians.multiview_pruning import badly_drawn, draw_views, multiview_error_scores, normalized_scores
 from sw_reference.rasterizer import ReferenceRasterizer
 
 from splatwizard_core.api import (
@@ -99,7 +99,7 @@ def plain_counts(model: GaussianModel, view: Picture, threshold: float) -> torch
 
 @pytest.mark.parametrize("threshold", [0.1, 0.6])
 def test_blame_is_what_a_loop_over_pixels_counts_times_the_losses(model, views, threshold):
-    found = blame_of_views(model, views, RASTERIZER, BLACK, threshold=threshold)
+    found = multiview_error_scores(model, views, RASTERIZER, BLACK, threshold=threshold)
     each = [plain_counts(model, view, threshold) for view in views]
     assert float(found[-1]) == 0 < float(found[0])
     blame = torch.zeros(model.num_rows)
@@ -120,29 +120,29 @@ def test_what_is_drawn_equally_well_everywhere_is_not_badly_drawn():
 
 
 def test_guilt_is_a_share_that_one_outlier_does_not_decide():
-    assert guilt(torch.tensor([1.0, 2.0, 5.0])).tolist() == [0.0, 0.25, 1.0]
+    assert normalized_scores(torch.tensor([1.0, 2.0, 5.0])).tolist() == [0.0, 0.25, 1.0]
     blame = torch.arange(2000.0)
     blame[-1] = 1e9
-    assert guilt(blame)[999] == pytest.approx(0.5, abs=1e-3)
+    assert normalized_scores(blame)[999] == pytest.approx(0.5, abs=1e-3)
 
 
 def test_guilt_is_a_share_of_the_largest_where_hardly_any_have_blame():
     blame = torch.zeros(2000)
     blame[:2] = torch.tensor([1.0, 4.0])
-    assert guilt(blame)[:3].tolist() == [0.25, 1.0, 0.0]
-    assert not guilt(torch.full((5,), 3.0)).any()
+    assert normalized_scores(blame)[:3].tolist() == [0.25, 1.0, 0.0]
+    assert not normalized_scores(torch.full((5,), 3.0)).any()
 
 
 def test_blame_that_is_not_finite_is_none():
     blame = torch.tensor([float("nan"), 1.0, 4.0, float("inf"), 0.0])
-    assert guilt(blame).tolist() == [0.0, 0.25, 1.0, 0.0, 0.0]
+    assert normalized_scores(blame).tolist() == [0.0, 0.25, 1.0, 0.0, 0.0]
 
 
 def test_blame_is_of_the_pictures_and_the_loss_that_are_trained(model, views):
     white = torch.full((3,), 3.0)  # drawings above 1, which a clamped training does not see
     settings = {"lambda_dssim": 0.5, "padding": "valid"}
-    found = blame_of_views(model, views[:1], RASTERIZER, white, clamp=True, **settings)
-    plain = blame_of_views(model, views[:1], RASTERIZER, white)
+    found = multiview_error_scores(model, views[:1], RASTERIZER, white, clamp=True, **settings)
+    plain = multiview_error_scores(model, views[:1], RASTERIZER, white)
     camera, truth = views[0].camera, views[0].image()
     drawn = RASTERIZER.render(model.gaussians(camera, RASTERIZER), camera, RasterOptions(background=white)).image
     loss = photometric_loss(drawn.detach().clamp(0, 1), truth, **settings).total
@@ -153,7 +153,7 @@ def test_blame_is_of_the_pictures_and_the_loss_that_are_trained(model, views):
 
 def test_blame_without_a_view_is_an_error(model):
     with pytest.raises(ValueError, match="at least one"):
-        blame_of_views(model, [], RASTERIZER, BLACK)
+        multiview_error_scores(model, [], RASTERIZER, BLACK)
 
 
 def test_views_are_drawn_once_each_and_all_where_there_are_no_more():
@@ -174,7 +174,7 @@ def scene_of(views) -> SimpleNamespace:
 
 def test_late_pruning_takes_the_faint_and_the_guilty(model, views):
     own = model_of(model.means.detach().clone(), model.opacities.detach())
-    stays = (own.opacities >= 0.1) & (guilt(blame_of_views(own, views, RASTERIZER, BLACK)) <= 0.5)
+    stays = (own.opacities >= 0.1) & (normalized_scores(multiview_error_scores(own, views, RASTERIZER, BLACK)) <= 0.5)
     assert 0 < int(stays.sum()) < int((own.opacities >= 0.1).sum())
     expected = own.means.detach()[stays]
     call = (scene_of(views), SimpleNamespace(iterations=100))

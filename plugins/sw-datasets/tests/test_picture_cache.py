@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sw_datasets.demo import kept, synthetic
+from sw_datasets.demo import picture_cache, synthetic
 from sw_datasets.demo.synthetic import DemoSize, make_scene
 
 SIZE = DemoSize(views=2, test_every=2, width=16, height=12, points=50, surface=100, samples=1)
@@ -19,7 +19,7 @@ SHAPE = (2, 3, 3)
 def folder(tmp_path, monkeypatch):
     """The folder of kept pictures, not there yet, in a cache of the test's own."""
     monkeypatch.setenv("SPLATWIZARD_CACHE", str(tmp_path / "cache"))
-    return tmp_path / "cache" / kept.FOLDER
+    return tmp_path / "cache" / picture_cache.FOLDER
 
 
 def pixels(value):
@@ -60,7 +60,7 @@ def test_whatever_changes_the_pixels_has_a_file_of_its_own(folder, size, options
 def test_other_sources_of_the_generator_have_other_files(folder, monkeypatch):
     view = make_scene(SIZE).train[0]
     assert view.pixels.numel()
-    monkeypatch.setattr(kept, "_drawn_by", lambda: b"another version")
+    monkeypatch.setattr(picture_cache, "_drawn_by", lambda: b"another version")
     del view.pixels
     assert view.pixels.numel()
     assert len(list(folder.iterdir())) == 2
@@ -94,29 +94,31 @@ def folder_there(file):
      lambda f: f.write_bytes(f.read_bytes() + b"x"), lambda f: f.chmod(0) or f.write_bytes(b"y" * 50)],
 )  # fmt: skip
 def test_a_damaged_file_is_drawn_again_and_mended(folder, spoil):
-    kept.kept_or_drawn("a", SHAPE, lambda: pixels(1))
+    picture_cache.kept_or_drawn("a", SHAPE, lambda: pixels(1))
     spoil(folder / "a")
-    assert (kept.kept_or_drawn("a", SHAPE, lambda: pixels(2)) == 2).all()
+    assert (picture_cache.kept_or_drawn("a", SHAPE, lambda: pixels(2)) == 2).all()
     if spoil is not folder_there:  # which is left alone
-        assert (kept.kept_or_drawn("a", SHAPE, refuse) == 2).all()
+        assert (picture_cache.kept_or_drawn("a", SHAPE, refuse) == 2).all()
 
 
 def test_the_oldest_make_room_and_the_size_stays_bounded(folder, monkeypatch):
-    one = kept.DIGEST_BYTES + 18
-    monkeypatch.setattr(kept, "MOST_BYTES", 3 * one)
+    one = picture_cache.DIGEST_BYTES + 18
+    monkeypatch.setattr(picture_cache, "MAX_BYTES", 3 * one)
     for i, name in enumerate("abcde"):
-        kept.kept_or_drawn(name, SHAPE, lambda: pixels(1))
+        picture_cache.kept_or_drawn(name, SHAPE, lambda: pixels(1))
         os.utime(folder / name, (i, i))
     assert {file.name for file in folder.iterdir()} == set("cde")
     assert sum(file.stat().st_size for file in folder.iterdir()) == 3 * one
-    monkeypatch.setattr(kept, "MOST_BYTES", one - 1)
-    assert (kept.kept_or_drawn("f", SHAPE, lambda: pixels(6)) == 6).all()  # too large to keep, and nothing is removed
+    monkeypatch.setattr(picture_cache, "MAX_BYTES", one - 1)
+    assert (
+        picture_cache.kept_or_drawn("f", SHAPE, lambda: pixels(6)) == 6
+    ).all()  # too large to keep, and nothing is removed
     assert {file.name for file in folder.iterdir()} == set("cde")
 
 
 def test_many_at_once_read_whole_pictures_or_draw(folder):
     def ask(i):
-        return kept.kept_or_drawn(f"picture {i % 3}", SHAPE, lambda: pixels(i % 3))
+        return picture_cache.kept_or_drawn(f"picture {i % 3}", SHAPE, lambda: pixels(i % 3))
 
     with ThreadPoolExecutor(8) as pool:
         found = list(pool.map(ask, range(60)))
@@ -128,7 +130,7 @@ def test_without_a_folder_to_write_to_pictures_are_drawn(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("no folder")
     monkeypatch.setenv("SPLATWIZARD_CACHE", str(tmp_path / "file" / "cache"))
     for value in (1, 2):
-        assert (kept.kept_or_drawn("a", SHAPE, lambda value=value: pixels(value)) == value).all()
+        assert (picture_cache.kept_or_drawn("a", SHAPE, lambda value=value: pixels(value)) == value).all()
 
 
 def test_a_full_disk_costs_the_kept_file_alone(folder, monkeypatch):
@@ -138,5 +140,5 @@ def test_a_full_disk_costs_the_kept_file_alone(folder, monkeypatch):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("pathlib.Path.write_bytes", full)
-    assert (kept.kept_or_drawn("a", SHAPE, lambda: pixels(1)) == 1).all()
+    assert (picture_cache.kept_or_drawn("a", SHAPE, lambda: pixels(1)) == 1).all()
     assert list(folder.iterdir()) == []

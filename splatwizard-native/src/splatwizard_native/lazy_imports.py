@@ -1,4 +1,4 @@
-"""Lending of names: a package offers names of its modules, each of which is imported when it is asked for."""
+"""Lazy re-exports: import a module when one of its public names is first used."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 
-def lend(
+def lazy_exports(
     face: str, modules: Mapping[str, str], base: Mapping[str, str] | None = None
 ) -> tuple[list[str], Callable[[str], Any]]:
     """Make `__all__` and `__getattr__` of the module `face`: a package, or a module directly in it.
 
-    modules     module of the package, without its name -> the names that it lends, separated by spaces
+    modules     module of the package, without its name -> names to re-export, separated by spaces
     base        the same of modules of this package
     """
     tables = ((face.partition(".")[0], modules), (__name__.partition(".")[0], base or {}))
@@ -25,7 +25,7 @@ def lend(
     }
 
     def find(name: str) -> Any:
-        """Import what is asked for, once: a plugin that only registers itself imports no torch."""
+        """Import a name on first use: a plugin that only registers itself imports no torch."""
         if name not in homes:
             raise AttributeError(f"module '{face}' has no attribute '{name}'")
         found = getattr(importlib.import_module(homes[name]), name)

@@ -1,4 +1,4 @@
-"""Rows of a model that mean nothing: left out, counted, and told alike by whatever reads a file."""
+"""Removal of invalid rows (NaN, infinite) from a loaded model, with a count for the user."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Learning rates that fall at the end of a training: what one view at a time leaves unsettled comes to rest."""
+"""Learning-rate decay of all parameter groups at the end of a training."""
 
 from collections.abc import Mapping
 
@@ -6,15 +6,15 @@ from splatwizard_core.api import SplatOptimizer
 
 
 class SettleLearningRates:
-    """Lowers learning rates log-linearly between two steps.
+    """Decays learning rates log-linearly between two steps.
 
     rates   parameter group -> its rate until `first`; groups that the optimizer lacks are left out
-    first   step up to which the rates are whole
-    last    step at which they are `factor` times as high, and from which they stay so
+    first   last step with full rates
+    last    step from which the rates are `factor` times the full ones
     factor  > 0, at most 1; with 1 nothing changes
 
-    Adam's step has the size of its learning rate however small a gradient is, so that with a constant rate a model goes
-    on swinging around what fits all views best. Source: our own; plans of 3DGS lower the rate of the means alone.
+    Adam's step size equals its learning rate however small the gradient is. So with a constant rate the parameters keep
+    oscillating around the optimum. Source: our own; plans of 3DGS lower the rate of the means alone.
     Raises ValueError for a factor outside its range, or last <= first.
     """
 
@@ -26,7 +26,7 @@ class SettleLearningRates:
         self.rates, self.first, self.last, self.factor = dict(rates), first, last, factor
 
     def share(self, step: int) -> float:
-        """Return by what the rates are multiplied at a step."""
+        """Return the factor of the learning rates at a step."""
         passed = min(max((step - self.first) / (self.last - self.first), 0.0), 1.0)
         return float(self.factor**passed)
 

@@ -1,4 +1,4 @@
-"""Drawn pictures kept on disk, so that the demo scene is drawn once on a machine and not once a run."""
+"""Disk cache of rendered pictures: the demo scene is rendered once per machine, not once per run."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from splatwizard_native import DiskFullError, cache_root, replacing
 
 FOLDER = "demo-pictures"
 """Below the folder of this user's caches; may be deleted at any time."""
-MOST_BYTES = 64 << 20
+MAX_BYTES = 64 << 20
 """All kept pictures together: `demo` takes 11 MB, `demo:tiny` 75 kB. The oldest make room for new ones."""
 DIGEST_BYTES = 32
 
@@ -81,7 +81,7 @@ def _read(file: Path, shape: tuple[int, int, int]) -> NDArray[np.uint8] | None:
 
 def _keep(file: Path, pixels: bytes) -> None:
     """Write a picture behind its digest, if it fits; raises OSError or DiskFullError."""
-    room = MOST_BYTES - DIGEST_BYTES - len(pixels)
+    room = MAX_BYTES - DIGEST_BYTES - len(pixels)
     if room < 0:
         return
     file.parent.mkdir(parents=True, exist_ok=True)

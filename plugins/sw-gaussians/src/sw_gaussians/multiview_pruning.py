@@ -1,6 +1,6 @@
-"""Blame of Gaussians: how much each takes part in the badly drawn pixels of several views.
+"""Multi-view consistent pruning: score Gaussians by the badly rendered pixels they cover in several views.
 
-One view can blame a Gaussian that others have a use for; what several blame is not needed (`fast_tasks.PruneByViews`).
+A Gaussian that is bad in one view may help others; one that is bad in several is pruned (`fast_tasks.PruneByViews`).
 Source: FastGS (arXiv 2511.04283), multi-view consistent pruning.
 """
 
@@ -23,27 +23,27 @@ from splatwizard_core.api import (
 )
 
 LOSS_THRESHOLD = 0.1
-"""Share of a view's largest error from which a pixel is badly drawn."""
-OUTLIERS = 0.001
-"""Share of the Gaussians that may have more blame than counts as all of it."""
+"""Normalised error (0..1 within a view) above which a pixel counts as badly rendered."""
+OUTLIER_SHARE = 0.001
+"""Share of the Gaussians whose scores are clipped to 1."""
 
 
-def guilt(blame: Tensor) -> Tensor:
-    """Return the blame [N] as a share, 0..1, of that which a thousandth of the Gaussians exceeds.
+def normalized_scores(blame: Tensor) -> Tensor:
+    """Scale scores [N] to 0..1: the least is 0, the 99.9 % quantile and all above it are 1.
 
-    Of the largest, as in the paper, where fewer than a thousandth have more than the least; elsewhere one outlier
-    would decide it. Blame that is not finite counts as none.
+    If that quantile equals the least score, the largest becomes 1, as in the paper; elsewhere one outlier would set
+    the scale. Scores that are not finite count as 0.
     """
     blame = blame.nan_to_num(0.0, 0.0, 0.0)
     low, most = blame.aminmax()
     # Not torch.kthvalue, which a GPU refuses where algorithms must be deterministic.
-    high = blame.sort().values[math.ceil((1 - OUTLIERS) * len(blame)) - 1]
+    high = blame.sort().values[math.ceil((1 - OUTLIER_SHARE) * len(blame)) - 1]
     high = torch.where(high > low, high, most)
     return ((blame - low) / (high - low).clamp_min(1e-30)).clamp_(0, 1)
 
 
 @torch.no_grad()
-def blame_of_views(
+def multiview_error_scores(
     model: SplatModel,
     views: Sequence[View],
     rasterizer: Rasterizer,
@@ -54,19 +54,19 @@ def blame_of_views(
     lambda_dssim: float = 0.2,
     padding: Literal["same", "valid"] = "same",
 ) -> Tensor:
-    """Return the blame [N] float32: for each view the badly drawn pixels of a Gaussian, times the view's loss.
+    """Return scores [N] float32: sum over views of a Gaussian's badly rendered pixels times the view's loss.
 
     background  [3] of the training, 0..1
-    threshold   a pixel is badly drawn where its absolute error, the mean over channels, brought to 0..1 by the view's
-                least and largest, exceeds this
-    clamp       bring drawings to 0..1 first, as a training with `clamp_render` does
+    threshold   a pixel is badly rendered if its error exceeds this: mean over channels of |render - image|, scaled to
+                0..1 by the view's least and largest
+    clamp       clamp renders to 0..1 first, as a training with `clamp_render` does
     lambda_dssim, padding   of the photometric loss, whatever else a stage adds to its own
 
-    A Gaussian takes part where its alpha is at least 1/255, before the pixel is opaque. Two drawings a view, no
+    A Gaussian covers a pixel if its alpha is at least 1/255 before the pixel is opaque. Renders each view twice, no
     gradient. Raises ValueError without views, CapabilityError of a rasterizer that does not count.
     """
     if not views:
-        raise ValueError("the blame of several views needs at least one")
+        raise ValueError("multi-view scores need at least one view")
     device = background.device
     blame = torch.zeros(model.num_rows, device=device)
     for view in views:
@@ -82,12 +82,12 @@ def blame_of_views(
 
 
 def badly_drawn(image: Tensor, truth: Tensor, threshold: float) -> Tensor:
-    """Return the pixels [H,W] bool whose error, of 0..1 in this view, exceeds the threshold; images [3,H,W]."""
+    """Return [H,W] bool: pixels whose error, scaled to 0..1 in this view, exceeds the threshold; images [3,H,W]."""
     error = (image - truth).abs().mean(dim=0)
     low, high = error.min(), error.max()
     return (error - low) > threshold * (high - low)
 
 
 def draw_views(views: Sequence[View], count: int, generator: torch.Generator) -> list[View]:
-    """Draw `count` views without replacement, or all if there are no more."""
+    """Sample `count` views without replacement, or all if there are fewer."""
     return [views[int(i)] for i in torch.randperm(len(views), generator=generator)[:count]]

@@ -1,4 +1,4 @@
-"""Adam's moments as a training left them, for a stage that goes on where it ended instead of starting afresh."""
+"""Adam's moments of a finished stage, kept with the model so that a later stage can continue from them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from splatwizard_core.api import SplatModel, SplatOptimizer
 
 
 class Moments:
-    """Moments by parameter name, on the CPU: a trained scene may stay on a GPU for long. Copied models share them."""
+    """Adam's moments by parameter name, on the CPU to free GPU memory. Copies of a model share them."""
 
     def __init__(self, optimizer: SplatOptimizer) -> None:
         self.by_name: dict[str, dict[str, Any]] = {
@@ -21,12 +21,12 @@ class Moments:
 
 
 def keep_moments(model: SplatModel, optimizer: SplatOptimizer) -> None:
-    """Leave the moments of a finished training with its model; they are no part of its state or its file."""
+    """Attach the optimizer's moments to the model; they are not saved in its state or its file."""
     model.moments = Moments(optimizer)  # type: ignore[assignment]
 
 
 def restore_moments(model: SplatModel, optimizer: SplatOptimizer) -> bool:
-    """Go on with the moments that a training left with the model; False where it left none (a .ply, say).
+    """Load the moments attached to the model into the optimizer; return False if there are none (e.g. from a .ply).
 
     Raises ValueError if rows came or went since.
     """

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from sw_gaussians.settling import SettleLearningRates
+from sw_gaussians.learning_rate_decay import SettleLearningRates
 
 from splatwizard_core.api import GaussianModel, ParamGroup, SplatOptimizer
 

@@ -1,4 +1,4 @@
-"""Hold what a stranger's rasterizer returns to its contract: types, sizes and gradients, which wait for no GPU."""
+"""Checks of a rasterizer's result against the contract: types, shapes and gradients, without waiting for a GPU."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
-from sw_datasets.gate import same_shape
+from sw_datasets.image_checks import same_shape
 from sw_datasets.loaders.colmap_model import ColmapCamera
 
 from splatwizard_core.errors import SceneError

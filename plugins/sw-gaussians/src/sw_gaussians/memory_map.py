@@ -1,4 +1,4 @@
-"""The bytes of a file as a view of the pages that the system holds."""
+"""Memory-mapped reading of files."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import stat
 from splatwizard_core.api import SceneError
 
 
-def mapped(path: str | os.PathLike[str]) -> bytes | memoryview:
-    """Return all bytes of a file; they stay mapped as long as anything views them.
+def memory_map(path: str | os.PathLike[str]) -> bytes | memoryview:
+    """Map a file into memory; the mapping lives as long as any view of it.
 
     Raises SceneError for what cannot be read and for what is no file, such as a pipe, which has no bytes to map.
     """
