@@ -98,17 +98,17 @@ def plain_counts(model: GaussianModel, view: Picture, threshold: float) -> torch
 
 
 @pytest.mark.parametrize("threshold", [0.1, 0.6])
-def test_blame_is_what_a_loop_over_pixels_counts_times_the_losses(model, views, threshold):
+def test_scores_are_what_a_loop_over_pixels_counts_times_the_losses(model, views, threshold):
     found = multiview_error_scores(model, views, RASTERIZER, BLACK, threshold=threshold)
     each = [plain_counts(model, view, threshold) for view in views]
     assert float(found[-1]) == 0 < float(found[0])
-    blame = torch.zeros(model.num_rows)
+    scores = torch.zeros(model.num_rows)
     for view, counts in zip(views, each, strict=True):
         drawn = RASTERIZER.render(
             model.gaussians(view.camera, RASTERIZER), view.camera, RasterOptions(background=BLACK)
         )
-        blame += photometric_loss(drawn.image, view.image()).total.detach() * counts
-    assert torch.allclose(found, blame, rtol=1e-5)
+        scores += photometric_loss(drawn.image, view.image()).total.detach() * counts
+    assert torch.allclose(found, scores, rtol=1e-5)
     assert model.means.grad is None
 
 
@@ -119,26 +119,26 @@ def test_what_is_drawn_equally_well_everywhere_is_not_badly_drawn():
     assert badly_drawn(image, torch.zeros(3, 4, 4), 0.1).nonzero().tolist() == [[1, 2]]
 
 
-def test_guilt_is_a_share_that_one_outlier_does_not_decide():
+def test_normalized_scores_are_shares_that_one_outlier_does_not_decide():
     assert normalized_scores(torch.tensor([1.0, 2.0, 5.0])).tolist() == [0.0, 0.25, 1.0]
-    blame = torch.arange(2000.0)
-    blame[-1] = 1e9
-    assert normalized_scores(blame)[999] == pytest.approx(0.5, abs=1e-3)
+    scores = torch.arange(2000.0)
+    scores[-1] = 1e9
+    assert normalized_scores(scores)[999] == pytest.approx(0.5, abs=1e-3)
 
 
-def test_guilt_is_a_share_of_the_largest_where_hardly_any_have_blame():
-    blame = torch.zeros(2000)
-    blame[:2] = torch.tensor([1.0, 4.0])
-    assert normalized_scores(blame)[:3].tolist() == [0.25, 1.0, 0.0]
+def test_normalized_scores_are_shares_of_the_largest_where_hardly_any_have_a_score():
+    scores = torch.zeros(2000)
+    scores[:2] = torch.tensor([1.0, 4.0])
+    assert normalized_scores(scores)[:3].tolist() == [0.25, 1.0, 0.0]
     assert not normalized_scores(torch.full((5,), 3.0)).any()
 
 
-def test_blame_that_is_not_finite_is_none():
-    blame = torch.tensor([float("nan"), 1.0, 4.0, float("inf"), 0.0])
-    assert normalized_scores(blame).tolist() == [0.0, 0.25, 1.0, 0.0, 0.0]
+def test_scores_that_are_not_finite_count_as_zero():
+    scores = torch.tensor([float("nan"), 1.0, 4.0, float("inf"), 0.0])
+    assert normalized_scores(scores).tolist() == [0.0, 0.25, 1.0, 0.0, 0.0]
 
 
-def test_blame_is_of_the_pictures_and_the_loss_that_are_trained(model, views):
+def test_scores_are_of_the_pictures_and_the_loss_that_are_trained(model, views):
     white = torch.full((3,), 3.0)  # drawings above 1, which a clamped training does not see
     settings = {"lambda_dssim": 0.5, "padding": "valid"}
     found = multiview_error_scores(model, views[:1], RASTERIZER, white, clamp=True, **settings)
@@ -151,7 +151,7 @@ def test_blame_is_of_the_pictures_and_the_loss_that_are_trained(model, views):
     assert not torch.equal(pixels.round(), (plain / photometric_loss(drawn.detach(), truth).total).round())
 
 
-def test_blame_without_a_view_is_an_error(model):
+def test_scores_without_a_view_are_an_error(model):
     with pytest.raises(ValueError, match="at least one"):
         multiview_error_scores(model, [], RASTERIZER, BLACK)
 

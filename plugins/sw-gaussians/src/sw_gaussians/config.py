@@ -86,14 +86,14 @@ class GaussianTraining(Exchangeable):
 
 
 SHORT, LONG = 0.4, 0.8
-"""Shares of the full plan up to which a run counts as short, and from which as long."""
+"""Bounds, as shares of the full schedule: shorter runs count as short, longer ones as long."""
 
 
 def rate_factors(share: float) -> dict[str, float]:
-    """Return by what two learning rates of the full plan are multiplied in a run of a share of its steps, > 0.
+    """Return the factors of two learning rates in a run of a given share, > 0, of the full schedule.
 
-    A short run ends with larger steps of the means, for they have less time to arrive; up to a long one the factor is
-    log-interpolated. SH bands 1 to 3 move twice as fast in all that is not long.
+    A short run ends with a larger learning rate of the means, as they have less time to converge. The factor is
+    log-interpolated up to a long run. SH bands 1 to 3 have twice the rate in every run that is not long.
 
     Source: LiteGS (arXiv 2503.01199), whose values are those of a third of the plan and of the whole; between: our own.
     """

@@ -92,12 +92,12 @@ class HalveOpacity:
 class PruneByViews:
     """Removes Gaussians that are nearly transparent, or that cover badly rendered pixels in several views.
 
-    views           training views that are drawn each time
-    min_opacity     fainter Gaussians go
+    views           training views sampled per call
+    min_opacity     prune Gaussians with a lower opacity
     most            prune Gaussians whose score exceeds this, 0..1 (`multiview_pruning.normalized_scores`)
     lambda_dssim, padding   of the photometric loss that a view's pixels are weighted with
 
-    Views are drawn as the training draws them, but on the scene's background even where that of a step is random.
+    Renders as in training, but on the scene background even if training uses random ones.
     Raises ValueError for less than one view, EmptyModel if nothing is left. Curve: "pruned", a number of Gaussians.
     Source: FastGS (arXiv 2511.04283), pruning after densification: 10 views, 0.1, 0.9.
     """
@@ -131,11 +131,11 @@ class PruneByViews:
             return
         with torch.no_grad():
             views = draw_views(scene.train, self.views, model.next_split_generator())
-            blame = multiview_error_scores(
+            scores = multiview_error_scores(
                 model, views, rasterizer, scene.background.to(model.device), clamp=ppl.clamp_render,
                 lambda_dssim=self.lambda_dssim, padding=self.padding,
             )  # fmt: skip
-            stays = (model.opacities >= self.min_opacity) & (normalized_scores(blame) <= self.most)
+            stays = (model.opacities >= self.min_opacity) & (normalized_scores(scores) <= self.most)
             left, before = int(stays.sum()), model.num_rows
             if left == 0:
                 raise EmptyModel(step)

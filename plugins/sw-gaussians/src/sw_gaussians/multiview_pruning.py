@@ -28,18 +28,18 @@ OUTLIER_SHARE = 0.001
 """Share of the Gaussians whose scores are clipped to 1."""
 
 
-def normalized_scores(blame: Tensor) -> Tensor:
+def normalized_scores(scores: Tensor) -> Tensor:
     """Scale scores [N] to 0..1: the least is 0, the 99.9 % quantile and all above it are 1.
 
     If that quantile equals the least score, the largest becomes 1, as in the paper; elsewhere one outlier would set
     the scale. Scores that are not finite count as 0.
     """
-    blame = blame.nan_to_num(0.0, 0.0, 0.0)
-    low, most = blame.aminmax()
+    scores = scores.nan_to_num(0.0, 0.0, 0.0)
+    low, most = scores.aminmax()
     # Not torch.kthvalue, which a GPU refuses where algorithms must be deterministic.
-    high = blame.sort().values[math.ceil((1 - OUTLIER_SHARE) * len(blame)) - 1]
+    high = scores.sort().values[math.ceil((1 - OUTLIER_SHARE) * len(scores)) - 1]
     high = torch.where(high > low, high, most)
-    return ((blame - low) / (high - low).clamp_min(1e-30)).clamp_(0, 1)
+    return ((scores - low) / (high - low).clamp_min(1e-30)).clamp_(0, 1)
 
 
 @torch.no_grad()
@@ -68,7 +68,7 @@ def multiview_error_scores(
     if not views:
         raise ValueError("multi-view scores need at least one view")
     device = background.device
-    blame = torch.zeros(model.num_rows, device=device)
+    scores = torch.zeros(model.num_rows, device=device)
     for view in views:
         camera = view.camera.to(device)
         inputs = model.gaussians(camera, rasterizer)
@@ -77,8 +77,8 @@ def multiview_error_scores(
         truth = view.image(background, device)
         hits = ScoreSpec("hits", "hits", pixel_weight=badly_drawn(image, truth, threshold))
         drawn = rasterizer.render(inputs, camera, RasterOptions(background=background, scores=(hits,))).scores["hits"]
-        blame += photometric_loss(image, truth, lambda_dssim=lambda_dssim, padding=padding).total * drawn
-    return blame
+        scores += photometric_loss(image, truth, lambda_dssim=lambda_dssim, padding=padding).total * drawn
+    return scores
 
 
 def badly_drawn(image: Tensor, truth: Tensor, threshold: float) -> Tensor:

@@ -1,6 +1,6 @@
-"""Base of a method's config whose blocks have names, `codec.name` say, and the keys that older releases had.
+"""Configs with named blocks, such as `codec.name`, and translation of keys of older releases.
 
-A block with one codec alone is an `OwnCodec`; those that a user exchanges for another provider's are `choices.Choice`.
+`OwnCodec` is a block with one fixed codec; `choices.Choice` is a block whose provider the user may exchange.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ ExchangeableT = TypeVar("ExchangeableT", bound="Exchangeable")
 
 
 class Named(Params):
-    """Block whose name alone may stand for it: `codec = "NAME"` for `codec.name = "NAME"`.
+    """Configuration block with a name: `codec = "NAME"` is short for `codec.name = "NAME"`.
 
     NAME    field that holds the name
     """
@@ -33,13 +33,13 @@ class Named(Params):
 
     @property
     def chosen(self) -> str:
-        """Name that stands in it."""
+        """Name of the chosen class."""
         found: str = getattr(self, self.NAME)
         return found
 
     @classmethod
     def settings_fields(cls) -> tuple[str, ...]:
-        """Return the fields whose keys are those of the provider that is named; none, where all keys are typed."""
+        """Return the fields whose keys the named provider defines; none if all keys are typed."""
         return ()
 
     def settings_keys(self, plugins: PluginManager, path: str) -> dict[str, str]:
@@ -66,7 +66,7 @@ class OwnCodec(Named):
 
 
 class Moved(NamedTuple):
-    """New place of a key of an older release.
+    """New key that replaces a key of an older release.
 
     keys        one or several; none: it is gone
     default     value that the older release had; a key that is gone is refused with another one, if this is not None
@@ -94,7 +94,7 @@ class Exchangeable(OptimizationParams):
     OLDER: ClassVar[Mapping[str, Moved]] = {}
 
     def spelled(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return values by dotted key with today's keys.
+        """Return values by dotted key, with older keys replaced by current ones.
 
         A name alone, `codec=NAME`, stands for the key of the name. Settings of another provider than the one named so
         far are gone. Keys of `OLDER` become those of today.
@@ -153,7 +153,7 @@ class Choosing(Exchangeable):
 
 
 def _blocks(config: BaseModel) -> Iterator[tuple[str, Named]]:
-    """Yield key and value of each block with a name."""
+    """Yield key and value of each `Named` block."""
     for name in type(config).model_fields:
         block = getattr(config, name)
         if isinstance(block, Named):

@@ -46,9 +46,9 @@ def register_tasks(registry: Registry) -> None:
     registry.add("densify-to-budget", "sw_gaussians.fast_tasks:DensifyToBudget",
                  summary="prune, and grow by a score within a budget (LiteGS)", factory=True)  # fmt: skip
     registry.add("halve-opacity", "sw_gaussians.fast_tasks:HalveOpacity",
-                 summary="halve every opacity and let Adam start afresh (LiteGS)", factory=True)  # fmt: skip
+                 summary="halve every opacity and reset Adam (LiteGS)", factory=True)  # fmt: skip
     registry.add("prune-by-views", "sw_gaussians.fast_tasks:PruneByViews",
-                 summary="remove what is faint, or what several views blame for their errors (FastGS)",
+                 summary="prune by opacity and by errors in several views (FastGS)",
                  factory=True)  # fmt: skip
     registry.add("sum-views", "sw_gaussians.late_batches:SumViews",
                  summary="update on the summed gradients of several views (dense Adam)",

@@ -62,7 +62,7 @@ class UpdateLearningRate:
         self.delay_steps, self.delay_mult = delay_steps, delay_mult
 
     def rate(self, step: int, extent: float) -> float:
-        """The step size of the means at `step`, world units."""
+        """Return the learning rate of the means at `step`, world units."""
         return extent * exponential_lr(
             step,
             init=self.init,
