@@ -51,6 +51,11 @@ def test_a_named_scene_is_taken_as_it_is(run: Path, capsys):
     assert "run directory" not in captured.err
 
 
+def test_another_scene_than_that_of_the_run_is_told(run: Path, capsys):
+    Choices(scene="demo").of_file(run / "scene.swz")
+    assert "lies in a run directory of scene demo:tiny, and is looked at on demo" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     "command",
     [

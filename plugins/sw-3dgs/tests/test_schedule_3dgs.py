@@ -9,7 +9,7 @@ from sw_gaussians.stage import ThreeDGSStage, UpdateLearningRate
 from sw_gaussians.start import gaussians_from_points
 from sw_gaussians.tasks import PruneAndDensify, ResetOpacity
 
-from splatwizard_core.errors import SceneError, UserInputError
+from splatwizard_core.errors import ConfigError, SceneError, UserInputError
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.runs.config import apply_overrides, resolve
@@ -241,3 +241,10 @@ def test_a_start_from_surfels_is_refused(tmp_path):
     (tmp_path / "m.ply").write_bytes(flat)
     with pytest.raises(UserInputError, match="these are surfels"):
         create(tiny_scene(), init=str(tmp_path / "m.ply"))
+
+
+@pytest.mark.parametrize(("key", "value"), [("mcmc.enabled", "maybe"), ("fast.densify", "bogus")])
+def test_an_older_switch_takes_its_values_alone(key, value):
+    plugins = load_plugins()
+    with pytest.raises(ConfigError, match=f"bad value '{value}' for '{key}'"):
+        resolve(plugins.methods.load("3dgs"), "paper", sets={key: value}, plugins=plugins)

@@ -79,6 +79,7 @@ HEAD = 'methods = ["3dgs"]\nscenes = ["demo"]\n'
     ("text", "told"),
     [
         ("methods = [", "is not valid TOML"),
+        ('method = ["3dgs"]\nscenes = ["demo"]', "bad value ['3dgs'] for 'method'"),
         ("", "`methods` is empty: there is nothing to run"),
         ('methods = ["3dgs"]\nscenes = []', "`scenes` is empty: there is nothing to run"),
         (HEAD + "seeds = []", "`seeds` is empty: there is nothing to run"),

@@ -418,3 +418,10 @@ def test_a_key_that_is_given_as_an_option_is_answered_with_set(arguments, told, 
 def test_an_option_that_is_no_key_is_no_option(arguments, capsys):
     assert main(arguments) == 2
     assert "No such option" in capsys.readouterr().err
+
+
+def test_a_configuration_that_names_no_preset_leaves_the_plan_that_of_paper(tmp_path: Path, capsys):
+    pytest.importorskip("sw_3dgs", reason="needs a method")
+    (tmp_path / "c.toml").write_text("seed = 1")
+    assert main(["schedule", "3dgs", "--config", str(tmp_path / "c.toml")]) == 0
+    assert capsys.readouterr().out.startswith("3dgs: 30,000 steps")

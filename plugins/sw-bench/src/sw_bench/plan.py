@@ -200,7 +200,8 @@ def flattened(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 def _told(error: ValidationError, source: str) -> str:
     """One line about the first thing that is wrong."""
-    first = error.errors()[0]
+    told = error.errors()  # what is wrong tells more than what is missing: it may be that, misspelt
+    first = next((each for each in told if each["type"] not in ("missing", "too_short")), told[0])
     *where, last = first["loc"] or ("the plan",)
     place = ".".join(map(str, [*where, last]))
     if first["type"] == "extra_forbidden":

@@ -19,6 +19,9 @@ _MCMC = (
     "init_opacity", "init_scale",
 )  # fmt: skip
 _BUDGET = ("score", "cap", "growth", "opacity", "morton")
+_ON = ("true", "1", "yes", "on")
+_SWITCH = (*_ON, "false", "0", "no", "off")  # values of `mcmc.enabled`
+_WAYS = ("threshold", "budget")  # values of `fast.densify`
 
 
 def _settings(block: str, names: tuple[str, ...], *providers: str) -> dict[str, Moved]:
@@ -66,7 +69,10 @@ def translated(values: dict[str, Any], density: DensityChoice) -> dict[str, Any]
         values["sparse_adam"] = sparse == "none"
     if chain is not None or way is not None:
         now = density.name
-        if str(chain).lower() in ("true", "1", "yes", "on"):
+        for key, value, known in (("mcmc.enabled", chain, _SWITCH), ("fast.densify", way, _WAYS)):
+            if value is not None and str(value).lower() not in known:
+                raise ConfigError(f"bad value '{value}' for '{key}', which is density=NAME since 0.3", key=key)
+        if str(chain).lower() in _ON:
             name = "mcmc"
         elif way is None:
             name = "adc" if now == "mcmc" else now

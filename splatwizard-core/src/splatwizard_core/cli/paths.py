@@ -37,6 +37,8 @@ def output_file(path: str | Path) -> Path:
     target = Path(path)
     if target.is_dir():
         raise UserInputError(f"{path} is a folder: give the name of a file in it")
+    if target.exists() and not target.is_file():
+        raise UserInputError(f"cannot write {path}: it is a pipe or a device, whose place a file would take")
     if not target.parent.is_dir():
         raise UserInputError(f"cannot write {path}: there is no folder {target.parent}")
     _check_writable(target.parent, f"cannot write {path}")

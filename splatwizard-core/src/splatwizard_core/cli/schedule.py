@@ -33,13 +33,15 @@ def schedule(method: str, verbose: bool, as_json: bool, chosen: Choices) -> None
     another package which one that is.
     """
     from splatwizard_core.plugins.origins import Origins
+    from splatwizard_core.runs.config import read_config_file
     from splatwizard_core.runs.phases import stage_parts
     from splatwizard_core.runs.pretrained import planned_stages
     from splatwizard_core.training.plan import format_plan, plan_rows
     from splatwizard_core.training.scheduler import build_schedulers
 
     plugins = load_plugins()
-    preset = chosen.preset or (None if chosen.config_file else "paper")
+    said = read_config_file(chosen.config_file) if chosen.config_file else {}
+    preset = chosen.preset or said.get("preset", "paper")
     resolved = replace(chosen, methods=(method,), preset=preset).resolve_one(plugins)
     tell_data_set_values([resolved])
     entry, origins = plugins.methods.entry(method), Origins(plugins)

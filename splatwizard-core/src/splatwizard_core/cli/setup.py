@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -164,6 +165,9 @@ class Choices:
         """
         found = self._scene_of(path)
         if found is None:
+            own = _scene_beside(path)
+            if self.scene and own and os.path.realpath(own) != os.path.realpath(self.scene):
+                tell(f"warning: {path} lies in a run directory of scene {own}, and is looked at on {self.scene}")
             return self
         scene, config = found
         tell(f"scene {scene}, as in the run directory that {path} lies in (--scene names another)")
@@ -184,13 +188,11 @@ class Choices:
 
         if self.scene is not None or (self.config_file and "scene" in read_config_file(self.config_file)):
             return None
-        config = path.absolute().parent / "config.toml"
-        scene = read_config_file(config).get("scene") if config.is_file() else None
-        if not isinstance(scene, str) or not scene:
+        if not (scene := _scene_beside(path)):
             raise UserInputError(
                 f"nothing says which scene {path} is of (no config.toml of a run lies beside it): name it by --scene"
             )
-        return scene, config
+        return scene, path.absolute().parent / "config.toml"
 
     def with_rate_of(self, directory: Path, plugins: PluginManager) -> Choices:
         """The same for a run directory: its config.toml, with what another rate point would change in it."""
@@ -313,3 +315,12 @@ def warn_of_metrics(
     for line in unavailable(entries, MetricSetup(session.device, settings)):
         if not quiet:
             say(f"warning: {line}")
+
+
+def _scene_beside(path: Path) -> str:
+    """Return the scene of the run directory that a file lies in, as written there; empty: nothing says it."""
+    from splatwizard_core.runs.config import read_config_file
+
+    config = path.absolute().parent / "config.toml"
+    scene = read_config_file(config).get("scene") if config.is_file() else None
+    return scene if isinstance(scene, str) else ""
