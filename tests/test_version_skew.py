@@ -215,3 +215,9 @@ def test_really_missing_packages(core, wheels, tmp_path):
     core.install(*(wheels[f"sw-{name}"] for name in ("codecs", "gaussians", "rasterizers", "reference")))
     decoded = json.loads(core.run("decode", str(path), "--repeats", "0", "--json").stdout)
     assert decoded["counts"] == {"num_gaussians": 48}
+
+
+def test_a_part_that_the_user_left_out_is_told_to_be_left_out(capsys, only):
+    only("3dgs")
+    assert main(["schedule", "3dgs"]) == 2
+    assert "it comes with sw-gaussians, which SW_PLUGINS=3dgs leaves out" in capsys.readouterr().err

@@ -45,6 +45,11 @@ def hub_folder() -> Path:
     return Path(torch.hub.get_dir()) / "checkpoints"
 
 
+def fetch_command() -> str:
+    """Command that brings the backbones' files, as it works where it is read: it wants a folder for data."""
+    return "`sw data fetch lpips`" if os.environ.get(DATA_VARIABLE) else f"`{DATA_VARIABLE}=DIR sw data fetch lpips`"
+
+
 def find_weights(net: str, folder: Path | None) -> Path | None:
     """The file of a backbone ("vgg", "alex"): in `folder`, where it was fetched, or in torch.hub's cache; else None."""
     name, data = BACKBONES[net].file_name, os.environ.get(DATA_VARIABLE)
@@ -63,7 +68,7 @@ def load_weights(net: str, folder: Path | None) -> Weights:
     backbone = BACKBONES[net]
     if path is None:
         raise CapabilityError(
-            f"weights-missing: {backbone.file_name} is needed: `sw data fetch lpips`, or get it from "
+            f"weights-missing: {backbone.file_name} is needed: {fetch_command()}, or get it from "
             f"{backbone.address} and name its folder with --set metrics.lpips.weights=DIR",
             missing=[backbone.file_name],
         )

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from splatwizard_core.api import CapabilityError, MetricSetup, PreparedMetric
 from sw_metrics.conventions import check_pair
-from sw_metrics.lpips_weights import BACKBONES, Weights, check_folder, find_weights, load_weights
+from sw_metrics.lpips_weights import BACKBONES, Weights, check_folder, fetch_command, find_weights, load_weights
 from sw_metrics.torchvision_import import import_torchvision
 
 EXTRA = "sw-metrics[lpips]"
@@ -143,7 +143,7 @@ def not_available(folder: Path | None) -> str | None:
     if not absent:
         return None
     return (
-        f"LPIPS is not available without its weights, its values will be null: `sw data fetch lpips`, or bring "
+        f"LPIPS is not available without its weights, its values will be null: {fetch_command()}, or bring "
         f"{' and '.join(absent)} from {BACKBONES['vgg'].address.rpartition('/')[0]}/ and give "
         "--set metrics.lpips.weights=DIR"
     )

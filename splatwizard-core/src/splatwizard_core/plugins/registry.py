@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import importlib
+import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -237,6 +238,9 @@ def nearest(kind: str, name: str, installed: list[str]) -> str:
     package = package_of(kind, name)
     if package is not None:
         return f"it comes with {package}: pip install {package}"
+    ours, chosen = catalogue().get(kind, {}).get(name), os.environ.get("SW_PLUGINS")
+    if ours is not None and chosen is not None:
+        return f"it comes with {ours}, which SW_PLUGINS={chosen} leaves out"
     import difflib
 
     near = difflib.get_close_matches(name, installed, n=1)
