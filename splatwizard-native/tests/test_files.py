@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from splatwizard_native import DiskFullError, ForeseenError, files
+from splatwizard_native import DiskFullError, files
 from splatwizard_native.files import (
     bytes_with_named,
     file_sha256,
@@ -223,19 +223,3 @@ def test_a_description_counts_with_the_files_that_it_names(tmp_path: Path):
     assert bytes_with_named(tmp_path / "a.webp") == 100
     plain = meta.rename(tmp_path / "meta.swz")
     assert bytes_with_named(plain) == plain.stat().st_size
-
-
-def test_a_pipe_keeps_its_place(tmp_path: Path):
-    os.mkfifo(pipe := tmp_path / "pipe")
-    with pytest.raises(ForeseenError, match="is a pipe or a device"), replacing(pipe) as path:
-        path.write_text("x")
-    assert pipe.is_fifo()
-    assert list(tmp_path.iterdir()) == [pipe]
-
-
-def test_what_a_link_leads_to_is_replaced(tmp_path: Path):
-    (tmp_path / "link").symlink_to(real := tmp_path / "real")
-    with replacing(tmp_path / "link") as path:
-        path.write_text("x")
-    assert (tmp_path / "link").is_symlink()
-    assert real.read_text() == "x"

@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from splatwizard_native.errors import FULL, DiskFullError, ForeseenError
+from splatwizard_native.errors import FULL, DiskFullError
 
 TEMPORARY = r"\.(\d+)-(?:([0-9a-f]{8})-)?[0-9a-f]{8}\.tmp"
 """The end of a temporary file's name, after `.NAME`: the process that writes it, where its number holds (`_numbering`;
@@ -42,13 +42,9 @@ def replacing(path: str | os.PathLike[str], *, wanted: int | None = None, durabl
     durable     on the disk itself before it takes its place: it holds after a power failure too
 
     If the block raises, `path` holds what it held before and the temporary file is gone. What killed processes left of
-    earlier writes to `path` is removed. A link stays one: what it leads to is replaced.
-
-    Raises DiskFullError, and ForeseenError for a pipe or a device; other errors of the system (OSError) pass through.
+    earlier writes to `path` is removed. Raises DiskFullError; other errors of the system (OSError) pass through.
     """
-    path = Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
-    if path.exists() and not path.is_file() and not path.is_dir():
-        raise ForeseenError(f"{path}: is a pipe or a device, whose place a file would take: name a file")
+    path = Path(path)
     temporary = _temporary(path)
     try:
         with naming_full_disk(path, wanted):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -33,8 +34,8 @@ def existing_file(path: str | Path) -> Path:
 
 
 def output_file(path: str | Path) -> Path:
-    """A path that a file can be written to."""
-    target = Path(path)
+    """A path that a file can be written to; of a link, what it leads to."""
+    target = Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
     if target.is_dir():
         raise UserInputError(f"{path} is a folder: give the name of a file in it")
     if target.exists() and not target.is_file():
