@@ -1,4 +1,4 @@
-"""What a message advises, as the code writes it: without the place of pip and of what it installs."""
+"""Advice in messages, as the code writes it: without the place of pip and of what it installs."""
 
 from __future__ import annotations
 

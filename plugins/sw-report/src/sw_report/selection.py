@@ -12,7 +12,7 @@ from sw_report.blocks import Note, Table
 from sw_report.numbers import is_lpips
 
 PAPER = ("method", "rate", "psnr", "ssim", "lpips", "size")
-"""What tables of papers show: of several forms of LPIPS the field's own."""
+"""Columns of a paper's table; of several forms of LPIPS the field's own."""
 LPIPS = "lpips"
 KNOWN = (*PAPER, "scenes", "seeds", "primitives", "steps", "train", "encode", "decode", "fps")
 """Columns that are no metrics, besides the usual metrics; any metric is one by its name."""

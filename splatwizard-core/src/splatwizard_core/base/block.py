@@ -8,7 +8,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict
 
 MemoryKind = Literal["cuda", "rss"]
-"""What was measured as memory: torch's allocator, or the growth of the resident set."""
+"""Kind of memory that was measured: torch's allocator, or the growth of the resident set."""
 
 
 class Block(BaseModel):

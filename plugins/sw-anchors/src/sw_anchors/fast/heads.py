@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from sw_anchors.fast.kernels import without_gaps
 from sw_anchors.fast.networks import parameters_of
 from sw_anchors.neural_gaussians import Networks, NeuralGaussians
 
@@ -51,10 +52,8 @@ class _Heads(torch.autograd.Function):
         *parameters: Tensor,
     ) -> tuple[Tensor, ...]:
         # Features, offsets and scales may be columns of a matrix: of these a row must be without gaps.
-        gaps = (None, None, (1,), (3, 1), (1,), None)
-        inputs = tuple(
-            t if t is None or (inner is not None and t.stride()[1:] == inner) else t.contiguous()
-            for t, inner in zip((center, positions, features, offsets, scales, masks), gaps, strict=True)
+        inputs = without_gaps(
+            (center, positions, features, offsets, scales, masks), (None, None, (1,), (3, 1), (1,), None)
         )
         found = torch.ops.sw_anchors.heads(*inputs, [p.contiguous() for p in parameters])
         gaussians, (opacities, *saved) = found[:5], found[5:]

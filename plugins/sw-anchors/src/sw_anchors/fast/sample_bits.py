@@ -8,18 +8,12 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from splatwizard_native import fast_enabled
-from sw_anchors.native import ANCHORS
+from sw_anchors.fast.kernels import fit_kernels
 
 
 def fits(*tensors: Tensor) -> bool:
     """Whether there is a kernel for the bits of these tensors, all float32 of one device; loads it."""
-    first = tensors[0]
-    if not fast_enabled() or len({(t.device, t.dtype) for t in tensors}) > 1:
-        return False
-    if first.dtype != torch.float32:
-        return False
-    return ANCHORS.has_cuda() if first.is_cuda else first.device.type == "cpu" and ANCHORS.try_load()
+    return len({t.device for t in tensors}) == 1 and fit_kernels(*tensors)
 
 
 def bits_of(

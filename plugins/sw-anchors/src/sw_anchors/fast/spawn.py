@@ -12,18 +12,15 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from splatwizard_native import fast_enabled
 from sw_anchors.fast import heads
+from sw_anchors.fast.kernels import fit_kernels, without_gaps
 from sw_anchors.fast.networks import network_outputs
-from sw_anchors.native import ANCHORS
 from sw_anchors.neural_gaussians import Networks, NeuralGaussians
 
 
 def fits(positions: Tensor, *others: Tensor | None) -> bool:
     """Whether there are kernels for anchors at `positions` and the other float32 tensors of `spawn`; loads them."""
-    if not fast_enabled() or any(t is not None and t.dtype != torch.float32 for t in (positions, *others)):
-        return False
-    return ANCHORS.has_cuda() if positions.is_cuda else positions.device.type == "cpu" and ANCHORS.try_load()
+    return fit_kernels(positions, *others)
 
 
 def spawn(
@@ -64,11 +61,7 @@ class _Gaussians(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, drawn: Tensor, *inputs: Tensor | None) -> tuple[Tensor, ...]:
         # Offsets and scales may be columns of a matrix: of these a row must be without gaps.
-        gaps = (None, None, None, None, (3, 1), (1,), None)
-        given = tuple(
-            t if t is None or (inner is not None and t.stride()[1:] == inner) else t.contiguous()
-            for t, inner in zip(inputs, gaps, strict=True)
-        )
+        given = without_gaps(inputs, (None, None, None, None, (3, 1), (1,), None))
         ctx.save_for_backward(*given, drawn)
         return tuple(torch.ops.sw_anchors.spawn(*given, drawn))
 

@@ -34,7 +34,7 @@ class PlaneSites(NamedTuple):
     weights: Tensor
 
     def rows(self, rows: Tensor) -> PlaneSites:
-        """Those of some of the places."""
+        """Return the cells and weights of the places `rows` [S] int64."""
         return PlaneSites(self.cells.index_select(0, rows), self.weights.index_select(0, rows))
 
 

@@ -8,13 +8,12 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from sw_anchors.fast.kernels import fit_kernels
 from sw_anchors.fast.predicted_steps import steps_by_torch, steps_fit_kernel
 from sw_anchors.fast.rows import add_rows, gathered
-from sw_anchors.native import ANCHORS
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from splatwizard_native import fast_enabled
 from sw_hac.config import SMALLEST_STEP
 
 OFFSET = 1.0
@@ -23,9 +22,7 @@ OFFSET = 1.0
 
 def fits(features: Tensor) -> bool:
     """Whether features [V,I] are float32 of a device with kernels; loads these."""
-    if not fast_enabled() or features.dtype != torch.float32:
-        return False
-    return ANCHORS.has_cuda() if features.is_cuda else features.device.type == "cpu" and ANCHORS.try_load()
+    return fit_kernels(features)
 
 
 def steps_and_outputs(
