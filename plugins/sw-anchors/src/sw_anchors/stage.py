@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+import torch
 from sw_gaussians.learning_rate import exponential_lr
 
 from splatwizard_core.api import (
@@ -30,7 +31,6 @@ from sw_anchors.growth import accumulate_anchor_statistics, adjust_anchors
 from sw_anchors.params import AnchorParams, CodedAnchorParams
 
 if TYPE_CHECKING:
-    import torch
     from torch import Tensor
 
     from splatwizard_core.api import (
@@ -75,8 +75,8 @@ class AnchorStage(Stage):
             raise TypeError(f"stage '{self.name}' trains a {self.trains.__name__}, not a {type(model).__name__}")
         self.growth_draws = context.generator("growth")
         self.extent = context.scene.extent
-        if self.opt.paired_offsets:
-            model.pair_offsets()
+        if self.opt.visible_offsets:
+            model.show_offsets(self.opt.visible_offsets, torch.stack([v.camera.center for v in context.scene.train]))
         return model
 
     # Optimizer
