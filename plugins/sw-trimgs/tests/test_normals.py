@@ -4,10 +4,10 @@ import math
 
 import pytest
 import torch
+from sw_gaussians.knn import nearest_neighbors
 
 from splatwizard_core.scene.camera import Camera
 from sw_trimgs.normals import near_surface, normal_difference, normals_of_depth, roughness, smooth_pixels, world_points
-from sw_trimgs.surface_state import nearest_neighbors
 
 
 def camera(width=40, height=30, dtype=torch.float64):

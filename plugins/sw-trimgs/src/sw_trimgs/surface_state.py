@@ -1,29 +1,8 @@
 """Schedule tasks of the regularisation by normals: when they are drawn, and whose neighbours are whose."""
 
-import numpy as np
-import torch
-from torch import Tensor
+from sw_gaussians.knn import nearest_neighbors
 
 from sw_trimgs.flat import FlatGaussians
-
-
-def nearest_neighbors(points: Tensor, neighbors: int) -> Tensor:
-    """Return indices of the nearest points, [N,k] int32, same device, the point itself (or a duplicate) first.
-
-    points      [N,3], finite
-    neighbors   k, the point itself included; fewer where there are fewer points
-
-    Exact (k-d tree on the CPU, float64).
-    """
-    n = points.shape[0]
-    k = min(neighbors, n)
-    if k < 1:
-        return torch.zeros(n, 0, dtype=torch.int32, device=points.device)
-    from scipy.spatial import cKDTree  # here, so that a process that only decodes does not import it
-
-    xyz = points.detach().cpu().numpy().astype(np.float64)
-    _, found = cKDTree(xyz).query(xyz, k=k, workers=-1)
-    return torch.from_numpy(found.reshape(n, k).astype(np.int32)).to(points.device)
 
 
 class DrawSurface:

@@ -116,12 +116,12 @@ class GaussianModel(SplatModel):
 
     @property
     def world_origin(self) -> Origin | None:
-        """Where the origin of the coordinates lies in the world, as the file says; None: it does not say."""
+        """Place (x, y, z) of the origin of the coordinates in the world, as the file says; None: it does not say."""
         return as_origin(self.origin.get(WORLD_ORIGIN))
 
     @property
     def world_shift(self) -> Origin | None:
-        """What an exporter adds to the coordinates: the world's origin, if world coordinates are asked for."""
+        """Shift (x, y, z) that an exporter adds to the coordinates, if those of the world are asked for; else None."""
         return self.world_origin if self.origin.get(AS_WORLD) else None
 
     @property
