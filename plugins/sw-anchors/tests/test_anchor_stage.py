@@ -11,7 +11,7 @@ from sw_anchors.coded_anchors import CodedAnchors
 from sw_anchors.fast.networks import network_outputs
 from sw_anchors.params import AnchorGrowth, AnchorParams, CodedAnchorLearningRates, CodedAnchorParams
 from sw_anchors.stage import AnchorStage, CodedAnchorStage
-from sw_gaussians.resolution import ResolutionPlan, ResolutionSampler
+from sw_gaussians.resolution import ResolutionPlan, ResolutionSampler, SmallPictures
 from sw_reference.rasterizer import ReferenceRasterizer
 
 from splatwizard_core.rendering.rasterizer import RasterOptions
@@ -221,7 +221,7 @@ def test_pictures_may_begin_small():
     plain, small = AnchorParams(), AnchorParams(pictures={"schedule": "dash"})
     scene = scene_of()
     assert not isinstance(AnchorStage(plain).create_sampler(scene, stream(0, "sampler")), ResolutionSampler)
-    sampler = AnchorStage(small).create_sampler(scene, stream(0, "sampler"))
+    sampler = AnchorStage(small, pictures=SmallPictures).create_sampler(scene, stream(0, "sampler"))
     assert isinstance(sampler, ResolutionSampler)
 
 
@@ -229,7 +229,8 @@ def test_pictures_may_begin_small():
 def test_statistics_between_two_adjustments_are_of_one_resolution(iterations):
     """The pause, too, ends where adjustments begin again, whatever length the plan is scaled to."""
     stage = AnchorStage(
-        AnchorParams(iterations=iterations, scale_schedule=True, pictures={"schedule": "dash", "start": 4.0})
+        AnchorParams(iterations=iterations, scale_schedule=True, pictures={"schedule": "dash", "start": 4.0}),
+        pictures=SmallPictures,
     )
     _, post = build_schedulers(stage, PipelineParams())
     adjusts = [entry for entry in post.registrations if entry.task == stage.adjust_anchor]

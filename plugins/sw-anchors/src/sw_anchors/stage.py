@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from sw_gaussians.learning_rate import exponential_lr
+from sw_gaussians.pictures import PictureSizes, Rounds
 
 from splatwizard_core.api import (
     LossPack,
@@ -58,9 +59,11 @@ class AnchorStage(Stage):
     opt: AnchorParams
     trains: type[AnchorModel] = AnchorModel
 
-    def __init__(self, opt: AnchorParams) -> None:
+    def __init__(self, opt: AnchorParams, *, pictures: PictureSizes | None = None) -> None:
+        """Set up for `opt`; pictures: `opt.pictures.load(plugins)`, None where their sizes do not change."""
         super().__init__(opt)
-        opt.pictures.check(opt)
+        opt.pictures.check(opt, pictures)
+        self.pictures = pictures
         self.extent = 1.0  # known when the stage begins; a plan can be printed without a scene
 
     def at(self, step: int) -> int:
@@ -82,14 +85,9 @@ class AnchorStage(Stage):
     # Optimizer
 
     def create_sampler(self, scene: Scene, generator: torch.Generator) -> CameraSampler:
-        return self.opt.pictures.sampler(
-            super().create_sampler(scene, generator),
-            scene,
-            self,
-            growth=[step for steps in self.adjustments for step in steps],
-            growth_stop=self.opt.growth.stop,
-            every=self.opt.growth.interval,
-        )
+        inner, growth = super().create_sampler(scene, generator), self.opt.growth
+        rounds = Rounds([step for steps in self.adjustments for step in steps], growth.stop, growth.interval)
+        return self.opt.pictures.sampler(self.pictures, inner, scene, self, rounds)
 
     def decay(self, step: int, init: float, final: float, *, max_steps: int | None = None) -> float:
         """Decay exponentially from `init` at step 0 to `final` at `max_steps` of the full run (None: lr.max_steps)."""
