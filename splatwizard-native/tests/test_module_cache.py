@@ -1,5 +1,6 @@
 """The cache of compiled libraries: what makes a new one, what is found again, what is damaged or foreign."""
 
+import errno
 import json
 import os
 import sys
@@ -84,6 +85,19 @@ def test_a_cache_that_cannot_be_written_is_named(package, monkeypatch, tmp_path)
     monkeypatch.setenv("SPLATWIZARD_CACHE", str(tmp_path / "file" / "below"))
     with pytest.raises(NativeBuildError, match=r"cannot write .*below.*SPLATWIZARD_CACHE"):
         package.module().load()
+
+
+@needs_compiler
+def test_a_full_disk_is_named_and_left_to_the_fallback(package, monkeypatch, caplog):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(library_module.os, "replace", full)
+    assert not package.module().try_load()
+    (record,) = caplog.records
+    assert "cannot write" in record.message
+    assert "No space left on device" in record.message
+    assert "answers are guessed" in record.message
 
 
 def test_the_cache_follows_the_platforms_convention(monkeypatch, tmp_path):
