@@ -63,6 +63,18 @@ def test_a_nan_is_no_score():
         lowest(torch.tensor([1.0, float("nan")]), 1)
 
 
+def test_a_pruner_that_compares_with_photographs_gets_the_views(scene):
+    class Comparing(Fixed):
+        score_views = Fixed.score
+
+        def score(self, *args):
+            raise AssertionError("there are photographs")
+
+    pruner = Comparing(torch.arange(10.0))
+    scores_of(pruner, model(), CameraIterator(scene.train), None, scene)
+    assert pruner.seen[0] == scene.train
+
+
 def test_the_task_removes_rows_and_moments_and_sees_every_camera_once(scene):
     gaussians = model()
     optimizer = SplatOptimizer(gaussians, [ParamGroup("means", 1e-3)])

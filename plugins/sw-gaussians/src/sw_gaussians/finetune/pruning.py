@@ -107,10 +107,15 @@ def scores_of(
 ) -> Tensor:
     """Return one score per row of the model, [N], rendered on the evaluation background.
 
-    Raises ShapeError or ValueError for what cannot be scores.
+    A pruner with `score_views` gets the views, pictures included; any other their cameras. Raises ShapeError or
+    ValueError for what cannot be scores.
     """
     background = scene.background.to(model.device)
-    scores = pruner.score(model, [view.camera for view in cameras], rasterizer, background)
+    score_views = getattr(pruner, "score_views", None)
+    if score_views is not None:
+        scores = score_views(model, cameras, rasterizer, background)
+    else:
+        scores = pruner.score(model, [view.camera for view in cameras], rasterizer, background)
     name = type(pruner).__name__
     if scores.shape != (model.num_rows,):
         raise ShapeError(
