@@ -8,11 +8,11 @@
 Rows of a scene, all uncoded, and their Gaussians:
 
 paper             3dgs as it is, whatever count it ends with
-fast, mcmc        3dgs grown to the count (`density.settings.cap`)
-mcmc, settled     the same, the last quarter without relocation, noise and loss terms
+fast, mcmc        3dgs grown to the count (`density.settings.cap`); mcmc as published, noise and loss terms to the end
+settled           mcmc, the last quarter without relocation, noise and loss terms
 mcmc, trained on  the scene of `mcmc`, 10,000 more steps of pruned-3dgs, none removed: what its steps alone bring
-X + SCORE         the scene of preset X grown to --grown (paper: as it is), pruned to the count by pruned-3dgs with
-                  that pruner; the same plan for every score
+X + SCORE         the scene of row X grown to --grown (paper: as it is), pruned to the count by pruned-3dgs with that
+                  pruner; the same plan for every score
 
 Cells are those of sweep_cells.py: one `sw bench`, resumed by the same command; at the end stands which ran, were there,
 are missing, unfinished or failed. A scene that several rows start from is trained once. Where a row has another count
@@ -35,26 +35,37 @@ from sweep_cells import Cell, add_options, chosen, print_outcomes, run_cells
 
 SCORES = "removal,lightgaussian,pup-3dgs,speedy-splat,trimming-the-fat,opacity"
 CAP = "density.settings.cap"
-SETTLED = tuple(f"density.settings.{key}=22500" for key in ("stop", "noise_stop", "terms_stop"))
+NEVER = 1_000_000
+STOPS = {
+    "mcmc": {"stop": 25_000, "noise_stop": NEVER, "terms_stop": NEVER},
+    "settled": dict.fromkeys(("stop", "noise_stop", "terms_stop"), 22_500),
+}
+"""Row -> ends of relocation, noise and loss terms, whatever the preset `mcmc` has."""
 ANY = 0
 """The count of a row that has one of its own."""
 
 Rows = Mapping[str, Mapping[int, Sequence[Cell]]]
 
 
-def grown(row: str, scene: str, seed: int, preset: str, count: int, sets: Sequence[str] = ()) -> Cell:
+def start_of(row: str, count: int) -> tuple[str, list[str]]:
+    """Preset of 3dgs and the values with which the scene of a row grows to a count (ANY: what it grows to)."""
+    sets = [f"density.settings.{key}={step}" for key, step in STOPS.get(row, {}).items()]
+    return "mcmc" if row in STOPS else row, [*sets, *([f"{CAP}={count}"] if count != ANY else [])]
+
+
+def grown(row: str, scene: str, seed: int, count: int) -> Cell:
     """A scene of 3dgs, uncoded, grown to a count."""
-    sets = (*sets, f"{CAP}={count}") if count != ANY else tuple(sets)
-    label = f"{row.replace(', ', '-')}-{count}" if count != ANY else row
-    return Cell(label, "3dgs", scene, "r6", seed, preset, sets=tuple(sets))
+    preset, sets = start_of(row, count)
+    return Cell(f"{row}-{count}" if count != ANY else row, "3dgs", scene, "r6", seed, preset, sets=tuple(sets))
 
 
-def pruned(row: str, scene: str, seed: int, preset: str, cap: int, count: int, *sets: str) -> Cell:
-    """A scene of a preset, grown to `cap` (ANY: as it is), pruned to a count (ANY: none removed) and trained on."""
+def pruned(row: str, scene: str, seed: int, cap: int, count: int, *sets: str) -> Cell:
+    """The scene of row "X + SCORE" or "X, trained on" grown to `cap`, with `count` left (ANY: all), and trained on."""
+    preset, values = start_of(row.split(",")[0].split(" + ")[0], cap)
+    start = (f"pretrained.preset={preset}", *(f"pretrained.{each}" for each in values))
     left = "prune.keep=1" if count == ANY else f"prune.count={count}"
-    start = (f"pretrained.preset={preset}", *([f"pretrained.{CAP}={cap}"] if cap != ANY else []))
-    label = f"{row.replace(', ', '-').replace(' + ', '-by-').replace(' ', '-')}-{count or cap}"
-    return Cell(label, "pruned-3dgs", scene, "r3", seed, sets=(*start, left, *sets))
+    label = row.replace(", ", "-").replace(" + ", "-by-").replace(" ", "-")
+    return Cell(f"{label}-{count or cap}", "pruned-3dgs", scene, "r3", seed, sets=(*start, left, *sets))
 
 
 def rows_of(scene: str, counts: Sequence[int], most: int, scores: Sequence[str], seeds: int) -> Rows:
@@ -65,18 +76,17 @@ def rows_of(scene: str, counts: Sequence[int], most: int, scores: Sequence[str],
         found.setdefault(row, {}).setdefault(count, []).append(cell)
 
     for seed in range(seeds):
-        add("paper", ANY, grown("paper", scene, seed, "paper", ANY))
+        add("paper", ANY, grown("paper", scene, seed, ANY))
         for count in counts:
-            add("fast", count, grown("fast", scene, seed, "fast", count))
-            add("mcmc", count, grown("mcmc", scene, seed, "mcmc", count))
-            add("mcmc, settled", count, grown("mcmc, settled", scene, seed, "mcmc", count, SETTLED))
-            add("mcmc, trained on", count, pruned("mcmc, trained on", scene, seed, "mcmc", count, ANY))
-            for preset, cap in (("paper", ANY), ("fast", most)):
-                row = f"{preset} + removal"
-                add(row, count, pruned(row, scene, seed, preset, cap, count))
+            for row in ("fast", "mcmc", "settled"):
+                add(row, count, grown(row, scene, seed, count))
+            add("mcmc, trained on", count, pruned("mcmc, trained on", scene, seed, count, ANY))
+            for start in ("paper", "fast", "settled"):
+                row = f"{start} + removal"
+                add(row, count, pruned(row, scene, seed, ANY if start == "paper" else most, count))
             for score in scores:
                 row = f"mcmc + {score}"
-                add(row, count, pruned(row, scene, seed, "mcmc", most, count, f"prune.pruner={score}"))
+                add(row, count, pruned(row, scene, seed, most, count, f"prune.pruner={score}"))
     return found
 
 

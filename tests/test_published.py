@@ -376,15 +376,17 @@ def test_the_table_of_removal_has_presets_and_scores_at_equal_counts(monkeypatch
     told = capsys.readouterr().out
     assert status == 0
     assert len(fake.commands) == 1
-    assert "17 cells: 17 ran" in told
+    assert "19 cells: 19 ran" in told
     rows = {line.split("│")[1].strip(): line.split("│")[2:5] for line in told.splitlines() if line.count("│") == 5}
-    assert set(rows) >= {"paper", "fast", "mcmc, settled", "mcmc, trained on", "paper + removal", "mcmc + opacity"}
+    assert set(rows) >= {"paper", "fast", "settled", "mcmc, trained on", "paper + removal", "mcmc + opacity"}
     assert [cell.strip() for cell in rows["mcmc + removal"]] == ["35.00", "35.00 (50)", ""]
     plan = read_plan(tmp_path / "out" / "cells.toml")
     assert plan is not None
     (cell,) = (c for c in table.rows_of("demo:tiny", [50], 200, ["opacity"], 1)["mcmc + opacity"][50])
     assert set(cell.sets) == {
         "pretrained.preset=mcmc", "pretrained.density.settings.cap=200", "prune.count=50", "prune.pruner=opacity",
+        "pretrained.density.settings.stop=25000", "pretrained.density.settings.noise_stop=1000000",
+        "pretrained.density.settings.terms_stop=1000000",
     }  # fmt: skip
     status, fake = bench(table, tmp_path / "out", *words)
-    assert "17 cells: 17 was there" in capsys.readouterr().out
+    assert "19 cells: 19 was there" in capsys.readouterr().out
