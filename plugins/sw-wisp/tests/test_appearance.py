@@ -1,0 +1,39 @@
+"""Colour coordinates and the appearance network."""
+
+import torch
+from sw_wisp.appearance import AppearanceNetwork, colour_of, sh_dc_of
+
+
+def test_colour_comes_back_and_is_orthonormal() -> None:
+    dc = torch.randn(50, 1, 3, dtype=torch.float64)
+    colour = colour_of(dc)
+    assert torch.allclose(sh_dc_of(colour), dc)
+    grey = colour_of(torch.zeros(1, 1, 3, dtype=torch.float64))  # 0.5, 0.5, 0.5
+    assert torch.allclose(grey, torch.tensor([[0.75**0.5, 0, 0]], dtype=torch.float64))
+
+
+def test_network_has_2537_numbers() -> None:
+    assert sum(p.numel() for p in AppearanceNetwork().parameters()) == 2_537
+
+
+def test_splats_without_latents_look_the_same_from_every_side_at_first() -> None:
+    network = AppearanceNetwork(generator=torch.Generator().manual_seed(0))
+    assert not network(torch.zeros(4, 12), torch.rand(4, 3)).any()
+
+
+def test_fit_reproduces_what_has_twelve_dimensions() -> None:
+    draws = torch.Generator().manual_seed(0)
+    rest = (torch.randn(300, 12, generator=draws) @ torch.randn(12, 45, generator=draws) + 0.3).view(300, 15, 3)
+    network = AppearanceNetwork()
+    latents = network.fit(rest, torch.rand(300, generator=draws) + 0.1)
+    assert torch.allclose(network(latents, torch.rand(300, 3)), rest, atol=1e-4)
+    assert torch.allclose(network.basis.T @ network.basis, torch.eye(12), atol=1e-5)
+
+
+def test_fit_prefers_what_weighs_more() -> None:
+    rest = torch.zeros(4, 15, 3)
+    rest[0, 0, 0], rest[1, 0, 0] = 1.0, -1.0
+    rest[2, 1, 0], rest[3, 1, 0] = 1.0, -1.0
+    network = AppearanceNetwork(latents=1)
+    network.fit(rest, torch.tensor([1.0, 1.0, 0.1, 0.1]))
+    assert network.basis.abs().argmax() == 0
