@@ -109,24 +109,25 @@ def jacobi(six: Tensor) -> tuple[Tensor, Tensor]:
 
     Cyclic Jacobi: vectorised over rows, nothing waits for a device. No gradient.
     """
-    entries = {place: six[:, k] for k, place in enumerate(SIX)}
-    ones, zeros = torch.ones_like(six[:, 0]), torch.zeros_like(six[:, 0])
-    columns = [torch.stack([ones if i == j else zeros for j in range(3)], dim=1) for i in range(3)]
+    rows = six.T.contiguous()  # [6,N]: long rows are fast
+    entries = {place: rows[k] for k, place in enumerate(SIX)}
+    zeros = torch.zeros_like(rows[0])
+    axes = list(torch.eye(3, dtype=six.dtype, device=six.device)[:, :, None].expand(3, 3, len(six)))  # each [3,N]
     tiny = torch.finfo(six.dtype).tiny
     for _ in range(SWEEPS):
         for p, q in ((0, 1), (0, 2), (1, 2)):
             r = 3 - p - q
             pr, qr = (min(p, r), max(p, r)), (min(q, r), max(q, r))
-            off, apart = entries[p, q], entries[q, q] - entries[p, p]
-            t = 2 * off / (apart + torch.copysign(torch.hypot(apart, 2 * off) + tiny, apart))
+            twice, apart = 2 * entries[p, q], entries[q, q] - entries[p, p]
+            t = twice / (apart + torch.copysign(torch.hypot(apart, twice) + tiny, apart))
             c = torch.rsqrt(1 + t * t)
             s = t * c
-            entries[p, p], entries[q, q] = entries[p, p] - t * off, entries[q, q] + t * off
+            shift = t * entries[p, q]
+            entries[p, p], entries[q, q] = entries[p, p] - shift, entries[q, q] + shift
             entries[pr], entries[qr] = c * entries[pr] - s * entries[qr], s * entries[pr] + c * entries[qr]
             entries[p, q] = zeros
-            c, s = c[:, None], s[:, None]
-            columns[p], columns[q] = c * columns[p] - s * columns[q], s * columns[p] + c * columns[q]
-    return torch.stack([entries[i, i] for i in range(3)], dim=1), torch.stack(columns, dim=2)
+            axes[p], axes[q] = c * axes[p] - s * axes[q], s * axes[p] + c * axes[q]
+    return torch.stack([entries[i, i] for i in range(3)], dim=1), torch.stack(axes).permute(2, 1, 0)
 
 
 class _Covariance(torch.autograd.Function):

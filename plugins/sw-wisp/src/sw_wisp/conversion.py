@@ -1,0 +1,70 @@
+"""From a trained 3DGS scene to splats of wisp."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from splatwizard_core.api import GaussianModel
+from sw_wisp.appearance import AppearanceNetwork, colour_of
+from sw_wisp.model import WispModel
+from sw_wisp.numbers import LATENTS
+from sw_wisp.positions import MARGIN, Root
+from sw_wisp.rate_model import StaticRate
+from sw_wisp.sensitivity import Removal, removal_cost, squared_slopes
+from sw_wisp.shape import log_covariance
+
+if TYPE_CHECKING:
+    from splatwizard_core.api import Rasterizer, View
+    from sw_wisp.config import WispConfig
+
+HEAD_ROOM = 1.5
+"""Splats that may begin, in caps: removal takes the rest while it trains."""
+
+
+def kept_rows(removal: Removal, config: WispConfig) -> Tensor:
+    """Return the rows [M] int64, ascending, that begin: the cap's of greatest worth, and few that do harm."""
+    costs, n = removal.squared_error, len(removal.squared_error)
+    cap = round(HEAD_ROOM * config.budget.cap * config.budget.cap_factor)
+    harmful = min(int((costs <= 0).sum()), int(config.budget.worthless * n))
+    keep = max(1, min(n - harmful, cap))
+    return torch.sort(costs, descending=True, stable=True).indices[:keep].sort().values
+
+
+def converted(
+    model: GaussianModel,
+    views: Sequence[View],
+    rasterizer: Rasterizer,
+    background: Tensor,
+    config: WispConfig,
+    generator: torch.Generator,
+) -> WispModel:
+    """Return the splats of a trained scene, at level 3 all of them; the stage sets levels by its rule.
+
+    generator   of random signs and of the network's first weights, on the CPU
+    """
+    model.active_sh_degree = model.max_sh_degree
+    removal = removal_cost(model, views, rasterizer, background, lambda_dssim=config.loss.lambda_dssim)
+    rows = kept_rows(removal, config)
+    network = AppearanceNetwork(
+        LATENTS.width, config.appearance.hidden, max(model.max_sh_degree, 1), generator=generator
+    ).to(background.device)
+    with torch.no_grad():
+        if model.max_sh_degree:
+            names, draws = ["sh_rest"], 2
+            slopes = squared_slopes(model, names, views, rasterizer, background, generator, draws=draws)["sh_rest"]
+            latents = network.fit(model.sh_rest[rows], slopes.flatten(1).mean(1)[rows])
+        else:
+            latents = model.means.new_zeros(len(rows), LATENTS.width)
+        shape, size = log_covariance(model.log_scales.double(), model.quats.double())
+        means = model.means[rows].detach()
+        rate = StaticRate(torch.tensor(config.base_steps, device=background.device)).to(background.device)
+        found = WispModel(
+            means, model.opacity_logits[rows], shape[rows], size[rows], colour_of(model.sh_dc)[rows], latents,
+            torch.full((len(rows),), 3, device=background.device), root=Root.around(means, MARGIN), network=network,
+            rate=rate, sharpest=config.phases.sharpness,
+        )  # fmt: skip
+        return found

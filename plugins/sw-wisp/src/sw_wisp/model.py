@@ -1,0 +1,178 @@
+"""The model while it trains: splats as the 22 numbers that the file holds, drawn as what rounding leaves of them."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+from splatwizard_core.api import SH, GaussianInputs, GaussianModel, SplatModel
+from sw_wisp.appearance import AppearanceNetwork, sh_dc_of
+from sw_wisp.numbers import COLOUR, GROUPS, LATENTS, OPACITY, SHAPE, SIZE
+from sw_wisp.positions import Root
+from sw_wisp.rate_model import Forecast, StaticRate
+from sw_wisp.rounding import FLOAT, HARD, disturbed
+from sw_wisp.shape import bounded, covariance, scales_and_quats
+
+if TYPE_CHECKING:
+    from splatwizard_core.api import Camera, Rasterizer
+
+THINNEST = 1e-6
+"""Smallest standard deviation, in edges of the root cube; the largest is the edge itself."""
+
+
+class WispModel(SplatModel):
+    """N splats.
+
+    means       [N,3] world units
+    opacity     [N] logit
+    shape       [N,5] deviator of the log covariance
+    size        [N] mean log scale, world units; the file has it relative to the edge of the splat's cell
+    colour      [N,3] luma and chroma
+    latents     [N,12] view dependence
+    levels      [N] int64, level of the octree
+    network     latents and colour to SH bands 1 and up
+    rate        distributions of the 22 numbers
+    low, edge   root cube: [3] and [] float64
+
+    phase       what is drawn: see `rounding`; in eval mode noise and soft rounding are left out
+    sharpness   of soft rounding, up to `sharpest`
+    jitters     whether positions are drawn anywhere in a cell of the splat's level around them
+    """
+
+    ROWS = ("means", "opacity", "shape", "size", "colour", "latents", "levels")
+    NUMBERS = ("opacity", "shape", "size", "colour", "latents")
+    """The parameters that hold the 22 numbers, in their order."""
+
+    levels: Tensor
+    low: Tensor
+    edge: Tensor
+
+    def __init__(
+        self, means: Tensor, opacity: Tensor, shape: Tensor, size: Tensor, colour: Tensor, latents: Tensor,
+        levels: Tensor, *, root: Root, network: AppearanceNetwork, rate: StaticRate, sharpest: float = 8.0,
+    ) -> None:  # fmt: skip
+        super().__init__()
+        rows = {
+            "means": means, "opacity": opacity, "shape": shape, "size": size, "colour": colour, "latents": latents
+        }  # fmt: skip
+        for name, values in rows.items():
+            self.register_parameter(name, nn.Parameter(values.detach().float().contiguous()))
+        self.register_buffer("levels", levels)
+        self.network, self.rate = network, rate
+        self.register_buffer("low", root.low.double().clone())
+        self.register_buffer("edge", torch.tensor(root.edge, dtype=torch.float64, device=means.device))
+        self.phase, self.sharpness, self.sharpest, self.jitters = FLOAT, 1.0, sharpest, False
+        self.split_seed = 0
+
+    @property
+    def root(self) -> Root:
+        """The root cube."""
+        return Root(self.low, self._edge)
+
+    @property
+    def _edge(self) -> float:
+        if self.__dict__.get("_known_edge") is None:  # reading it waits for a GPU, and every step asks
+            self.__dict__["_known_edge"] = float(self.edge)
+        found: float = self.__dict__["_known_edge"]
+        return found
+
+    def set_root(self, root: Root) -> None:
+        """Replace the root cube."""
+        self.low.copy_(root.low)
+        self.edge.fill_(root.edge)
+        self.__dict__["_known_edge"] = None
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Bounds of the log scales."""
+        return math.log(THINNEST * self._edge), math.log(self._edge)
+
+    def numbers(self, rows: Tensor | None = None) -> Tensor:
+        """The 22 numbers [N,22] of all splats or of some rows, size relative to the cell; differentiable."""
+        def of(name: str) -> Tensor:
+            values: Tensor = getattr(self, name)
+            return values if rows is None else values.index_select(0, rows)
+
+        levels = self.levels if rows is None else self.levels.index_select(0, rows)
+        size = of("size") - self.root.log_edges(levels)
+        return torch.cat([of("opacity")[:, None], of("shape"), size[:, None], of("colour"), of("latents")], dim=1)
+
+    @torch.no_grad()
+    def set_numbers(self, values: Tensor) -> None:
+        """Take the 22 numbers [N,22] of all splats, size relative to the cell, in place."""
+        opacity, shape, size, colour, latents = (values[:, group.columns] for group in GROUPS)
+        self.opacity.copy_(opacity.squeeze(1))
+        self.shape.copy_(shape)
+        self.size.copy_(size.squeeze(1) + self.root.log_edges(self.levels))
+        self.colour.copy_(colour)
+        self.latents.copy_(latents)
+
+    def forecast(self, rows: Tensor | None = None) -> Forecast:
+        """Distributions of the numbers of all splats, or of some rows."""
+        return self.rate.forecast(self.levels if rows is None else self.levels.index_select(0, rows))
+
+    def _drawn(self, values: Tensor, forecast: Forecast) -> Tensor:
+        phase = self.phase if self.training or self.phase == HARD else FLOAT
+        return disturbed(values, forecast.mean, forecast.steps, phase, self.sharpness, self.sharpest)
+
+    def bits(self, rows: Tensor | None = None) -> Tensor:
+        """Bits [N,22] of the numbers of all splats, or of some rows, as this phase rounds them; differentiable."""
+        forecast = self.forecast(rows)
+        return self.rate.rate(self._drawn(self.numbers(rows), forecast), forecast)
+
+    def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
+        """All splats, whatever the camera."""
+        values = self.numbers()
+        if self.phase != FLOAT:
+            values = self._drawn(values, self.forecast())
+        means, edges = self.means, self.root.log_edges(self.levels)
+        if self.jitters and self.training:
+            means = means + (torch.rand_like(means) - 0.5) * edges.exp()[:, None]
+        colour = values[:, COLOUR.columns]
+        return GaussianInputs(
+            means=means,
+            opacities=torch.sigmoid(values[:, OPACITY.columns].squeeze(1)),
+            cov3d=covariance(
+                values[:, SHAPE.columns], values[:, SIZE.columns].squeeze(1) + edges, *self.bounds
+            ),
+            sh=SH(
+                dc=sh_dc_of(colour),
+                rest=self.network(values[:, LATENTS.columns], colour),
+                active_degree=self.network.degree,
+            ),
+        )  # fmt: skip
+
+    @torch.no_grad()
+    def tidied(self) -> dict[str, Tensor]:
+        """The 22 numbers by parameter, within the ranges that are kept; shapes within the bounds of the root cube."""
+        shape, size = bounded(self.shape, self.size, *self.bounds)
+        edges = self.root.log_edges(self.levels)
+        limits = {group.name: group.limit for group in GROUPS}
+        size = (size - edges).clamp(-limits["size"], limits["size"]) + edges
+        found = {"opacity": self.opacity, "shape": shape, "size": size, "colour": self.colour, "latents": self.latents}
+        return {k: v if k == "size" else v.detach().clamp(-limits[k], limits[k]) for k, v in found.items()}
+
+    @torch.no_grad()
+    def as_gaussians(self) -> GaussianModel:
+        """The plain Gaussians that are drawn in eval mode, with all SH bands."""
+        values = self.numbers()
+        if self.phase != FLOAT:
+            values = self._drawn(values, self.forecast())
+        size = values[:, SIZE.columns].squeeze(1) + self.root.log_edges(self.levels)
+        shape, size = bounded(values[:, SHAPE.columns], size, *self.bounds)
+        colour = values[:, COLOUR.columns]
+        return GaussianModel.from_tensors(
+            self.means, sh_dc_of(colour), self.network(values[:, LATENTS.columns], colour),
+            values[:, OPACITY.columns].squeeze(1), *scales_and_quats(shape, size),
+        )  # fmt: skip
+
+    def state_dict_extra(self) -> dict[str, Any]:
+        return {"phase": self.phase, "sharpness": self.sharpness, "jitters": self.jitters, "seed": self.split_seed}
+
+    def load_state_dict_extra(self, extra: dict[str, Any]) -> None:
+        self.phase, self.sharpness = str(extra["phase"]), float(extra["sharpness"])
+        self.jitters, self.split_seed = bool(extra["jitters"]), int(extra["seed"])
+        self.__dict__["_known_edge"] = None

@@ -1,0 +1,300 @@
+"""The training stage: from a trained scene to integers, with the bits of the whole file in the loss."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor
+
+from splatwizard_core.api import (
+    CameraIterator,
+    EmptyModel,
+    GaussianModel,
+    LossPack,
+    OptimizationParams,
+    ParamGroup,
+    PipelineParams,
+    Rasterizer,
+    RenderResult,
+    Scene,
+    Scheduler,
+    SplatModel,
+    SplatOptimizer,
+    Stage,
+    StageContext,
+    TaskLog,
+    View,
+    photometric_loss,
+    stream,
+)
+from sw_wisp.config import WispConfig
+from sw_wisp.conversion import converted
+from sw_wisp.model import WispModel
+from sw_wisp.positions import MARGIN, Root, levels_by_cost, levels_by_size
+from sw_wisp.removal import copy_some, unworthy
+from sw_wisp.rounding import FINAL, HARD, NOISE, SOFT
+from sw_wisp.sensitivity import Removal, removal_cost, squared_slopes
+
+NETWORK_EPS = 1e-8
+SENSITIVE_VIEWS = 64
+"""Most views that squared slopes are measured over inside a training."""
+
+
+class WispStage(Stage):
+    """Trains a WispModel out of a trained 3DGS scene.
+
+    1. SETTLE   the scene as 22 numbers a splat
+    2. NOISE    uniform noise in place of rounding; lambda rises; splats that cost more than they are worth go
+    3. PLACE    positions become cell centres
+    4. ROUND    noise becomes soft rounding, soft rounding hard rounding
+    5. FREEZE   the integers are fixed; the appearance network learns on
+    """
+
+    name = "wisp"
+    starts_from = "3dgs"
+
+    def __init__(self, opt: WispConfig) -> None:
+        super().__init__(opt)
+        self.config = opt
+        self._pixels = 1.0  # of a training picture, in the mean
+
+    # Bounds of this run
+
+    def step_of(self, step: int) -> int:
+        """Scale a step of the full run to this run."""
+        found = self.when(step)
+        assert isinstance(found, int)
+        return found
+
+    @property
+    def removals(self) -> range:
+        """Steps of this run that remove splats."""
+        prune = self.config.prune
+        found = self.when(range(prune.start, prune.stop, prune.every) if prune.rd else range(0))
+        assert isinstance(found, range)
+        return found
+
+    def price(self, step: int | None = None) -> float:
+        """Loss of one bit at a step of this run; None: once lambda has risen."""
+        rate = self.config.rate_term
+        full = rate.lambda_ / self._pixels
+        if step is None:
+            return full
+        start, ramp = self.step_of(rate.start), self.step_of(rate.ramp)
+        return full * min(max((step - start) / ramp, 0.0), 1.0)
+
+    # Set-up
+
+    def begin(self, context: StageContext) -> SplatModel:
+        model, scene = context.model, context.scene
+        views = scene.train
+        self._pixels = sum(view.camera.width * view.camera.height for view in views) / len(views)
+        if not isinstance(model, GaussianModel):
+            raise TypeError(f"wisp starts from explicit Gaussians, not from a {type(model).__name__}")
+        background = scene.background.to(model.device)
+        found = converted(model, views, context.rasterizer, background, self.config, context.generator("method"))
+        found.split_seed = context.generator("split").initial_seed()
+        self.tidy(found)
+        self.set_levels(found, views, context.rasterizer, background, "begin")
+        found.rate.measure(found.numbers().detach(), found.levels)
+        return found
+
+    def create_optimizer(self, model: SplatModel, scene: Scene) -> SplatOptimizer:
+        rates = self.rates(0, scene.extent)
+        return SplatOptimizer(
+            model,
+            [ParamGroup(name, rate, eps=NETWORK_EPS if name == "network" else 1e-15) for name, rate in rates.items()],
+        )
+
+    def rates(self, step: int, extent: float) -> dict[str, float]:
+        """Learning rate of each parameter group at a step of this run; means: world units."""
+        lr, share = self.config.lr, min(step / max(self.iterations, 1), 1.0)
+        plans = {
+            "means": lr.means, "opacity": lr.opacity, "shape": lr.shape, "size": lr.shape, "colour": lr.colour,
+            "latents": lr.latents, "network": lr.networks,
+        }  # fmt: skip
+        rates = {k: math.exp((1 - share) * math.log(p.first) + share * math.log(p.last)) for k, p in plans.items()}
+        rates["means"] *= extent
+        if step > self.step_of(self.config.phases.place):
+            rates["means"] = 0.0
+        if step > self.step_of(self.config.phases.freeze):
+            rates |= dict.fromkeys(WispModel.NUMBERS, 0.0)
+        return rates
+
+    # Schedule
+
+    def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
+        phases, rebuild = self.config.phases, self.config.context.rebuild
+        scheduler.register_task(range(self.iterations + 1), self.update_lr, name="update lr")
+        scheduler.register_task(self.when(phases.noise), self.begin_noise, name="begin noise")
+        scheduler.register_task(self.when(list(phases.levels)), self.fix_levels, name="fix levels")
+        scheduler.register_task(self.when(phases.cells), self.begin_jitter, name="draw positions anywhere in cells")
+        scheduler.register_task(self.when(phases.place), self.place, name="place splats in cells")
+        soft = self.when(range(phases.soft, phases.hard))
+        scheduler.register_task(soft, self.soften, name="soft rounding")
+        scheduler.register_task(self.when(phases.hard), self.harden, name="hard rounding")
+        measured = self.when(range(phases.noise, phases.freeze, rebuild))
+        scheduler.register_task(measured, self.measure, name="measure rate model")
+        scheduler.register_task(self.when(phases.freeze), self.freeze, name="fix integers")
+
+    def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
+        if self.config.prune.rd:
+            scheduler.register_task(self.removals, self.prune, name="remove by rate and distortion")
+
+    def update_lr(self, optimizer: SplatOptimizer, scene: Scene, step: int) -> None:
+        """Set the step sizes."""
+        for name, rate in self.rates(step, scene.extent).items():
+            optimizer.set_lr(name, rate)
+
+    def begin_noise(self, model: WispModel) -> None:
+        """Draw numbers with uniform noise from here on."""
+        model.phase = NOISE
+
+    def begin_jitter(self, model: WispModel) -> None:
+        """Draw positions anywhere in a cell around them from here on."""
+        model.jitters = True
+
+    def soften(self, model: WispModel, step: int) -> None:
+        """Draw numbers softly rounded, more sharply with each step."""
+        phases = self.config.phases
+        first, last = self.step_of(phases.soft), self.step_of(phases.hard)
+        model.phase = SOFT
+        model.sharpness = 1 + (phases.sharpness - 1) * (step - first) / max(last - 1 - first, 1)
+
+    def harden(self, model: WispModel) -> None:
+        """Draw rounded numbers from here on."""
+        model.phase = HARD
+
+    def measure(self, model: WispModel) -> None:
+        """Bring the rate model up to date."""
+        model.rate.measure(model.numbers(), model.levels)
+
+    def fix_levels(
+        self, model: WispModel, cameras: CameraIterator, rasterizer: Rasterizer, scene: Scene, step: int
+    ) -> None:
+        """Set the level of every splat by the rule."""
+        with still(model):
+            self.set_levels(model, cameras, rasterizer, scene.background.to(model.device), str(step))
+        self.measure(model)
+
+    def place(
+        self, model: WispModel, cameras: CameraIterator, rasterizer: Rasterizer, scene: Scene, step: int
+    ) -> None:
+        """Put every splat at the centre of its cell for good."""
+        self.tidy(model)
+        model.set_root(Root.around(model.means))
+        with still(model):
+            self.set_levels(model, cameras, rasterizer, scene.background.to(model.device), str(step))
+        root = model.root
+        model.means.copy_(root.centres(root.cells(model.means, model.levels), model.levels))
+        model.jitters = False
+        self.measure(model)
+
+    def freeze(self, model: WispModel) -> None:
+        """Round all numbers for good."""
+        self.measure(model)
+        forecast = model.forecast()
+        values = model.numbers()
+        values = forecast.mean + forecast.steps * ((values - forecast.mean) / forecast.steps).round()
+        model.set_numbers(values)
+        model.phase = FINAL
+
+    def prune(
+        self,
+        model: WispModel,
+        optimizer: SplatOptimizer,
+        cameras: CameraIterator,
+        rasterizer: Rasterizer,
+        scene: Scene,
+        step: int,
+        log: TaskLog,
+    ) -> None:
+        """Remove what costs more bits than it is worth, and copy others in place of some."""
+        if step >= self.iterations:
+            return
+        before, prune = model.num_rows, self.config.prune
+        background = scene.background.to(model.device)
+        with still(model):
+            cost = self.cost(model, cameras, rasterizer, background)
+            bits = model.bits().sum(1) + model.rate.position_bits[model.levels]
+        doomed = unworthy(cost.loss_rise, bits, self.price(), prune.share)
+        if len(doomed) == before:
+            raise EmptyModel(step)
+        kept = torch.ones(before, dtype=torch.bool, device=model.device)
+        kept[doomed] = False
+        optimizer.keep_rows(model, kept)
+        copies = int(prune.respawn * len(doomed)) if step < self.step_of(prune.respawn_stop) else 0
+        added = copy_some(model, optimizer, copies, step)
+        self.tidy(model)
+        if step < self.step_of(self.config.phases.levels[0]):
+            model.set_root(Root.around(model.means, MARGIN))
+            with still(model):
+                self.set_levels(model, cameras, rasterizer, background, str(step))
+        self.measure(model)
+        limited = " (as many as may go: budget.cap is high)" if len(doomed) == int(prune.share * before) else ""
+        log.say(
+            f"removed {len(doomed):,} of {before:,} splats{limited}, {added:,} copies, {bits.mean().item():.1f} bits each"
+        )
+        log.scalar("pruned", len(doomed))
+        log.scalar("added", added)
+
+    # Parts
+
+    def cost(self, model: SplatModel, views: list[View], rasterizer: Rasterizer, background: Tensor) -> Removal:
+        """Cost of removing each splat, over all training views."""
+        return removal_cost(model, views, rasterizer, background, lambda_dssim=self.config.loss.lambda_dssim)
+
+    def tidy(self, model: WispModel) -> None:
+        """Bring all numbers into the ranges that are kept."""
+        for name, values in model.tidied().items():
+            model.get_parameter(name).data.copy_(values)
+
+    def set_levels(
+        self, model: WispModel, views: list[View], rasterizer: Rasterizer, background: Tensor, stream_name: str
+    ) -> None:
+        """Set the level of every splat by `positions.rule`."""
+        rule, edge = self.config.positions, model.root.edge
+        bounds = rule.level_min, rule.level_max
+        if rule.rule == "mid":
+            levels = levels_by_size(model.shape.detach(), model.size.detach(), edge, rule.eta, bounds)
+        else:
+            draws = stream(model.split_seed, f"levels/{stream_name}")
+            some = [views[i] for i in torch.randperm(len(views), generator=draws)[:SENSITIVE_VIEWS].tolist()]
+            slopes = squared_slopes(model, ["means"], some, rasterizer, background, draws)["means"].sum(1)
+            cost = self.cost(model, views, rasterizer, background)
+            scale = cost.loss / (2 * cost.total_error) * len(views) / len(some)
+            levels = levels_by_cost(slopes.double() * scale, self.price(), edge, rule.eta, bounds)
+        model.levels = levels
+
+    def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
+        """The photometric loss, lambda times the bits of the file over the pixels of a picture, the mean opacity."""
+        assert isinstance(model, WispModel)
+        config = self.config
+        truth = view.image(background, result.image.device)
+        pack = photometric_loss(result.image, truth, lambda_dssim=config.loss.lambda_dssim)
+        total, parts = pack.total, dict(pack.parts)
+        if config.loss.opacity and step < self.step_of(config.loss.opacity_stop):
+            total = total + config.loss.opacity * result.inputs.opacities.mean()
+        price = self.price(step)
+        if price and step <= self.step_of(config.phases.freeze):
+            n = model.num_rows
+            count = max(1, math.ceil(config.rate_term.sample * n))
+            rows = torch.randint(n, (count,), device=model.device)
+            bits = model.bits(rows).sum() / count
+            parts["bits"] = bits.detach()  # of a splat's 22 numbers
+            total = total + price * n * bits
+        return LossPack(total, parts)
+
+
+@contextmanager
+def still(model: SplatModel) -> Iterator[None]:
+    """Draw without noise inside."""
+    was = model.training
+    model.eval()
+    try:
+        yield
+    finally:
+        model.train(was)
