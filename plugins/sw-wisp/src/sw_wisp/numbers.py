@@ -48,3 +48,6 @@ LIMITS = tuple(group.limit for group in GROUPS for _ in group.steps)
 
 LOWEST_LEVEL, HIGHEST_LEVEL = 3, 18
 """Levels of the octree at which splats may sit; a cell of level l has edge root edge / 2^l."""
+
+BLOCKS = (OPACITY.columns, slice(SHAPE.columns.start, SIZE.columns.stop), COLOUR.columns, LATENTS.columns)
+"""Columns that are predicted and coded at once: opacity; shape and size; colour; latents."""
