@@ -1,7 +1,9 @@
 """Colour coordinates and the appearance network."""
 
+import pytest
 import torch
-from sw_wisp.appearance import AppearanceNetwork, colour_of, sh_dc_of
+
+from sw_wisp.appearance import AppearanceNetwork, colour_of, eight_bits, sh_dc_of
 
 
 def test_colour_comes_back_and_is_orthonormal() -> None:
@@ -37,3 +39,24 @@ def test_fit_prefers_what_weighs_more() -> None:
     network = AppearanceNetwork(latents=1)
     network.fit(rest, torch.tensor([1.0, 1.0, 0.1, 0.1]))
     assert network.basis.abs().argmax() == 0
+
+
+def test_rounded_network_is_the_one_of_the_file() -> None:
+    draws = torch.Generator().manual_seed(5)
+    network = AppearanceNetwork(generator=draws)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.copy_(torch.randn(parameter.shape, generator=draws))
+        network.basis[0, 0] = 40.0  # one large weight must not cost the rest of its row
+    latents, colour = torch.randn(30, 12, generator=draws), torch.rand(30, 3, generator=draws)
+    network.rounds = True
+    again = AppearanceNetwork.of_layers(network.layers(), 3)
+    assert torch.allclose(network(latents, colour), again(latents, colour), atol=2e-3)  # biases of 16 bits
+    for name in ("basis", "hidden.weight", "out.weight"):
+        assert torch.equal(eight_bits(network.get_parameter(name)), again.get_parameter(name))
+
+
+def test_layers_that_do_not_fit_are_refused() -> None:
+    layers = AppearanceNetwork().layers()
+    with pytest.raises(ValueError, match="no appearance network"):
+        AppearanceNetwork.of_layers(layers, 2)

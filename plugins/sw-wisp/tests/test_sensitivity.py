@@ -2,10 +2,10 @@
 
 import pytest
 import torch
-from sw_rasterizers.standard import StandardRasterizer
-from sw_wisp.sensitivity import removal_cost, squared_slopes
 
 from splatwizard_core.api import Camera, GaussianModel, RasterOptions, View
+from sw_rasterizers.standard import StandardRasterizer
+from sw_wisp.sensitivity import removal_cost, squared_slopes
 
 
 def _scene(n: int = 20, size: int = 32, views: int = 3) -> tuple[GaussianModel, list[View]]:

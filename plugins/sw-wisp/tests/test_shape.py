@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+
 from sw_wisp import shape as s
 
 LOW, HIGH = -9.0, 3.0
@@ -92,8 +93,8 @@ def test_what_lies_outside_is_drawn_on_the_bound_and_learns_its_way_back() -> No
     d.requires_grad_()
     drawn = s.covariance(d, m, LOW, HIGH)
     assert drawn[0, 5].item() == pytest.approx(math.exp(2 * HIGH), rel=1e-5)
-    back, = torch.autograd.grad(drawn[0, 5], d, retain_graph=True)
-    out, = torch.autograd.grad(-drawn[0, 5], d)
+    (back,) = torch.autograd.grad(drawn[0, 5], d, retain_graph=True)
+    (out,) = torch.autograd.grad(-drawn[0, 5], d)
     assert back.abs().max() > 1
     assert out.abs().max() == 0
 

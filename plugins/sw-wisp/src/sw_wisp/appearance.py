@@ -6,11 +6,14 @@ The network is asked once for each splat, when a file is decoded (or at each ste
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from splatwizard_core.api import SH_C0
+from sw_wisp.eight_bits import HIGHEST_EXPONENT, LARGEST_WEIGHT, LOWEST_EXPONENT, EightBitLayer
 
 COLOURS = 3
 
@@ -38,12 +41,16 @@ class AppearanceNetwork(nn.Module):
     hidden      W1, b1
     out         W2, b2; zero at first, so that a splat with a = 0 looks the same from every side
 
+    rounds      whether it computes with the weights of the file, of eight bits, with straight-through gradients
+
     With 12 latents, 32 hidden numbers and degree 3: 2,537 numbers.
     """
 
-    def __init__(self, latents: int = 12, hidden: int = 32, degree: int = 3, *, generator: torch.Generator | None = None):
+    def __init__(
+        self, latents: int = 12, hidden: int = 32, degree: int = 3, *, generator: torch.Generator | None = None
+    ) -> None:
         super().__init__()
-        self.degree = degree
+        self.degree, self.rounds = degree, False
         outputs = 3 * ((degree + 1) ** 2 - 1)
         basis = torch.randn(outputs, latents, generator=generator)
         self.basis = nn.Parameter(torch.linalg.qr(basis).Q if outputs >= latents else basis)
@@ -58,9 +65,35 @@ class AppearanceNetwork(nn.Module):
 
     def forward(self, latents: Tensor, colour: Tensor) -> Tensor:
         """Return SH coefficients [N,K/3,3] of bands 1 and up for latents [N,A] and colours [N,3]; differentiable."""
-        inner = torch.relu(self.hidden(torch.cat([latents, colour], dim=1)))
-        rest: Tensor = self.out(inner) + latents @ self.basis.T
+        basis, first, last = self.basis, self.hidden.weight, self.out.weight
+        if self.rounds:
+            basis, first, last = eight_bits(basis), eight_bits(first), eight_bits(last)
+        inner = torch.relu(F.linear(torch.cat([latents, colour], dim=1), first, self.hidden.bias))
+        rest: Tensor = F.linear(inner, last, self.out.bias) + latents @ basis.T
         return rest.view(len(latents), -1, 3)
+
+    def layers(self) -> tuple[EightBitLayer, ...]:
+        """Return what the file holds: B, W1 with b1, W2 with b2."""
+        pairs = ((self.basis, None), (self.hidden.weight, self.hidden.bias), (self.out.weight, self.out.bias))
+        arrays = [[None if t is None else t.detach().cpu().double().numpy() for t in pair] for pair in pairs]
+        return tuple(EightBitLayer.nearest(weight, bias) for weight, bias in arrays)  # type: ignore[arg-type]
+
+    @classmethod
+    def of_layers(cls, layers: Sequence[EightBitLayer], degree: int) -> AppearanceNetwork:
+        """Return the network that a file holds. Raises ValueError for layers that do not fit together."""
+        (basis, _), (first, first_bias), (last, last_bias) = (layer.floats() for layer in layers)
+        outputs, latents = basis.shape
+        hidden = len(first)
+        if first.shape[1] != latents + COLOURS or last.shape != (outputs, hidden) or outputs != 3 * (degree + 2) * degree:
+            raise ValueError(f"no appearance network has layers {basis.shape}, {first.shape}, {last.shape}")
+        network = cls(latents, hidden, degree)
+        with torch.no_grad():
+            network.basis.copy_(torch.from_numpy(basis))
+            network.hidden.weight.copy_(torch.from_numpy(first))
+            network.hidden.bias.copy_(torch.from_numpy(first_bias))
+            network.out.weight.copy_(torch.from_numpy(last))
+            network.out.bias.copy_(torch.from_numpy(last_bias))
+        return network
 
     @torch.no_grad()
     def fit(self, sh_rest: Tensor, weights: Tensor) -> Tensor:
@@ -78,3 +111,18 @@ class AppearanceNetwork(nn.Module):
         self.basis.copy_(basis.to(self.basis))
         self.out.bias.copy_(mean.to(self.out.bias))
         return (centred @ basis).to(sh_rest)
+
+
+def eight_bits(weight: Tensor) -> Tensor:
+    """Return weights [out,in] as q 2^e, |q| <= 127, with the exponent of least error for each row; straight-through.
+
+    The same as `EightBitLayer.nearest` of them.
+    """
+    with torch.no_grad():
+        exact = weight.double()
+        exponents = torch.arange(LOWEST_EXPONENT, HIGHEST_EXPONENT + 1, device=weight.device)
+        units = (2.0**exponents.double())[:, None, None]
+        tried = (exact / units).round().clamp(-LARGEST_WEIGHT, LARGEST_WEIGHT) * units  # [E,out,in]
+        best = (tried - exact).square().sum(2).argmin(0)  # [out]
+        rounded = tried.gather(0, best[None, :, None].expand(1, -1, weight.shape[1]))[0].to(weight)
+    return weight + (rounded - weight.detach())

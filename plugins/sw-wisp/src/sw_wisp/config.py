@@ -8,6 +8,7 @@ from pydantic import Field
 from sw_gaussians.named_blocks import Choosing, OwnCodec
 
 from splatwizard_core.api import Params
+from sw_wisp.numbers import LATENTS
 
 
 class Budget(Params):
@@ -67,7 +68,9 @@ class Prune(Params):
     stop: int = Field(10_501, ge=1, description="no removal from this step on")
     every: int = Field(1_000, ge=1, description="steps between removals")
     share: float = Field(0.15, gt=0, lt=1, description="largest share of the splats that one of them takes")
-    respawn: float = Field(1 / 3, ge=0, le=1, description="share of the removed ones that come back as copies of others")
+    respawn: float = Field(
+        1 / 3, ge=0, le=1, description="share of the removed ones that come back as copies of others"
+    )
     respawn_stop: int = Field(8_000, ge=0, description="none come back from this step on")
 
 
@@ -146,7 +149,7 @@ class WispConfig(Choosing):
 
     @property
     def base_steps(self) -> tuple[float, ...]:
-        """Base steps of the 22 numbers, in their order."""
+        """Quantiser steps of the 22 numbers."""
         s = self.steps
-        steps = (s.opacity, *(s.shape,) * 5, s.size, s.luma, s.chroma, s.chroma, *(s.latents,) * 12)
-        return tuple(step * s.factor for step in steps)
+        steps = (s.opacity, *(s.shape,) * 5, s.size, s.luma, s.chroma, s.chroma, *(s.latents,) * LATENTS.width)
+        return tuple(s.factor * step for step in steps)

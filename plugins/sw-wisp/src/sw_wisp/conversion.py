@@ -10,9 +10,10 @@ from torch import Tensor
 
 from splatwizard_core.api import GaussianModel
 from sw_wisp.appearance import AppearanceNetwork, colour_of
+from sw_wisp.cube import Cube
 from sw_wisp.model import WispModel
-from sw_wisp.numbers import LATENTS
-from sw_wisp.positions import MARGIN, Root
+from sw_wisp.numbers import LATENTS, LOWEST_LEVEL
+from sw_wisp.positions import MARGIN
 from sw_wisp.rate_model import StaticRate
 from sw_wisp.sensitivity import Removal, removal_cost, squared_slopes
 from sw_wisp.shape import log_covariance
@@ -61,10 +62,9 @@ def converted(
             latents = model.means.new_zeros(len(rows), LATENTS.width)
         shape, size = log_covariance(model.log_scales.double(), model.quats.double())
         means = model.means[rows].detach()
-        rate = StaticRate(torch.tensor(config.base_steps, device=background.device)).to(background.device)
-        found = WispModel(
+        rate = StaticRate(torch.tensor(config.base_steps)).to(background.device)
+        return WispModel(
             means, model.opacity_logits[rows], shape[rows], size[rows], colour_of(model.sh_dc)[rows], latents,
-            torch.full((len(rows),), 3, device=background.device), root=Root.around(means, MARGIN), network=network,
-            rate=rate, sharpest=config.phases.sharpness,
+            torch.full((len(rows),), LOWEST_LEVEL, device=background.device), cube=Cube.around(means, margin=MARGIN),
+            network=network, rate=rate, sharpest=config.phases.sharpness,
         )  # fmt: skip
-        return found

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatwizard_core.api import Method, SceneError
+import torch
+
+from splatwizard_core.api import BitstreamError, Method, SceneError
+from sw_wisp import file
+from sw_wisp.appearance import AppearanceNetwork
 from sw_wisp.config import WispConfig
-from sw_wisp.model import WispModel
+from sw_wisp.model import WispModel, plain_gaussians
 from sw_wisp.presets import BY_DATASET, PRESETS, RATES
 from sw_wisp.stage import WispStage
 
 if TYPE_CHECKING:
-    import torch
-
     from splatwizard_core.api import ContainerReader, ContainerWriter, Scene, SplatModel, Stage
 
 
@@ -45,8 +48,15 @@ class Wisp(Method):
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         if not isinstance(model, WispModel):
             raise TypeError(f"wisp encodes its own splats, not a {type(model).__name__}")
-        raise NotImplementedError
+        file.encode(model.coded(), writer)
 
     def decode(self, reader: ContainerReader) -> SplatModel:
         self.check_version(reader)
-        raise NotImplementedError
+        decoded = file.decode(reader)
+        levels = torch.from_numpy(decoded.state.levels)
+        log_edges = math.log(decoded.cube.edge) - math.log(2.0) * levels
+        try:
+            network = AppearanceNetwork.of_layers(decoded.appearance, decoded.sh_degree)
+        except ValueError as error:
+            raise BitstreamError(f"{reader.name}: {error}", section="networks") from error
+        return plain_gaussians(decoded.means(), decoded.values(), log_edges.float(), decoded.cube, network)

@@ -10,8 +10,9 @@ from torch import Tensor, nn
 
 from splatwizard_core.api import SH, GaussianInputs, GaussianModel, SplatModel
 from sw_wisp.appearance import AppearanceNetwork, sh_dc_of
+from sw_wisp.cube import Cube
+from sw_wisp.file import Scene
 from sw_wisp.numbers import COLOUR, GROUPS, LATENTS, OPACITY, SHAPE, SIZE
-from sw_wisp.positions import Root
 from sw_wisp.rate_model import Forecast, StaticRate
 from sw_wisp.rounding import FLOAT, HARD, disturbed
 from sw_wisp.shape import bounded, covariance, scales_and_quats
@@ -21,6 +22,27 @@ if TYPE_CHECKING:
 
 THINNEST = 1e-6
 """Smallest standard deviation, in edges of the root cube; the largest is the edge itself."""
+
+
+def bounds_in(cube: Cube) -> tuple[float, float]:
+    """Return the bounds of the log scales of splats in a root cube."""
+    return math.log(THINNEST * cube.edge), math.log(cube.edge)
+
+
+@torch.no_grad()
+def plain_gaussians(
+    means: Tensor, values: Tensor, log_edges: Tensor, cube: Cube, network: AppearanceNetwork
+) -> GaussianModel:
+    """Return splats as Gaussians that need no network to be drawn.
+
+    means       [N,3] world units
+    values      [N,22] their numbers
+    log_edges   [N] logarithms of the edges of their cells
+    """
+    opacity, shape, size, colour, latents = (values[:, group.columns] for group in GROUPS)
+    shape, size = bounded(shape, size.squeeze(1) + log_edges, *bounds_in(cube))
+    rest = network(latents, colour)
+    return GaussianModel.from_tensors(means, sh_dc_of(colour), rest, opacity.squeeze(1), *scales_and_quats(shape, size))
 
 
 class WispModel(SplatModel):
@@ -35,7 +57,7 @@ class WispModel(SplatModel):
     levels      [N] int64, level of the octree
     network     latents and colour to SH bands 1 and up
     rate        distributions of the 22 numbers
-    low, edge   root cube: [3] and [] float64
+    cube        the root cube of the octree
 
     phase       what is drawn: see `rounding`; in eval mode noise and soft rounding are left out
     sharpness   of soft rounding, up to `sharpest`
@@ -47,12 +69,10 @@ class WispModel(SplatModel):
     """The parameters that hold the 22 numbers, in their order."""
 
     levels: Tensor
-    low: Tensor
-    edge: Tensor
 
     def __init__(
         self, means: Tensor, opacity: Tensor, shape: Tensor, size: Tensor, colour: Tensor, latents: Tensor,
-        levels: Tensor, *, root: Root, network: AppearanceNetwork, rate: StaticRate, sharpest: float = 8.0,
+        levels: Tensor, *, cube: Cube, network: AppearanceNetwork, rate: StaticRate, sharpest: float = 8.0,
     ) -> None:  # fmt: skip
         super().__init__()
         rows = {
@@ -62,42 +82,28 @@ class WispModel(SplatModel):
             self.register_parameter(name, nn.Parameter(values.detach().float().contiguous()))
         self.register_buffer("levels", levels)
         self.network, self.rate = network, rate
-        self.register_buffer("low", root.low.double().clone())
-        self.register_buffer("edge", torch.tensor(root.edge, dtype=torch.float64, device=means.device))
+        self.cube = cube
         self.phase, self.sharpness, self.sharpest, self.jitters = FLOAT, 1.0, sharpest, False
         self.split_seed = 0
 
-    @property
-    def root(self) -> Root:
-        """The root cube."""
-        return Root(self.low, self._edge)
-
-    @property
-    def _edge(self) -> float:
-        if self.__dict__.get("_known_edge") is None:  # reading it waits for a GPU, and every step asks
-            self.__dict__["_known_edge"] = float(self.edge)
-        found: float = self.__dict__["_known_edge"]
-        return found
-
-    def set_root(self, root: Root) -> None:
-        """Replace the root cube."""
-        self.low.copy_(root.low)
-        self.edge.fill_(root.edge)
-        self.__dict__["_known_edge"] = None
+    def log_edges(self, levels: Tensor) -> Tensor:
+        """Logarithms [N] of the edges of cells at levels [N]."""
+        return math.log(self.cube.edge) - math.log(2.0) * levels.float()
 
     @property
     def bounds(self) -> tuple[float, float]:
         """Bounds of the log scales."""
-        return math.log(THINNEST * self._edge), math.log(self._edge)
+        return bounds_in(self.cube)
 
     def numbers(self, rows: Tensor | None = None) -> Tensor:
         """The 22 numbers [N,22] of all splats or of some rows, size relative to the cell; differentiable."""
+
         def of(name: str) -> Tensor:
             values: Tensor = getattr(self, name)
             return values if rows is None else values.index_select(0, rows)
 
         levels = self.levels if rows is None else self.levels.index_select(0, rows)
-        size = of("size") - self.root.log_edges(levels)
+        size = of("size") - self.log_edges(levels)
         return torch.cat([of("opacity")[:, None], of("shape"), size[:, None], of("colour"), of("latents")], dim=1)
 
     @torch.no_grad()
@@ -106,7 +112,7 @@ class WispModel(SplatModel):
         opacity, shape, size, colour, latents = (values[:, group.columns] for group in GROUPS)
         self.opacity.copy_(opacity.squeeze(1))
         self.shape.copy_(shape)
-        self.size.copy_(size.squeeze(1) + self.root.log_edges(self.levels))
+        self.size.copy_(size.squeeze(1) + self.log_edges(self.levels))
         self.colour.copy_(colour)
         self.latents.copy_(latents)
 
@@ -128,7 +134,7 @@ class WispModel(SplatModel):
         values = self.numbers()
         if self.phase != FLOAT:
             values = self._drawn(values, self.forecast())
-        means, edges = self.means, self.root.log_edges(self.levels)
+        means, edges = self.means, self.log_edges(self.levels)
         if self.jitters and self.training:
             means = means + (torch.rand_like(means) - 0.5) * edges.exp()[:, None]
         colour = values[:, COLOUR.columns]
@@ -149,7 +155,7 @@ class WispModel(SplatModel):
     def tidied(self) -> dict[str, Tensor]:
         """The 22 numbers by parameter, within the ranges that are kept; shapes within the bounds of the root cube."""
         shape, size = bounded(self.shape, self.size, *self.bounds)
-        edges = self.root.log_edges(self.levels)
+        edges = self.log_edges(self.levels)
         limits = {group.name: group.limit for group in GROUPS}
         size = (size - edges).clamp(-limits["size"], limits["size"]) + edges
         found = {"opacity": self.opacity, "shape": shape, "size": size, "colour": self.colour, "latents": self.latents}
@@ -161,18 +167,27 @@ class WispModel(SplatModel):
         values = self.numbers()
         if self.phase != FLOAT:
             values = self._drawn(values, self.forecast())
-        size = values[:, SIZE.columns].squeeze(1) + self.root.log_edges(self.levels)
-        shape, size = bounded(values[:, SHAPE.columns], size, *self.bounds)
-        colour = values[:, COLOUR.columns]
-        return GaussianModel.from_tensors(
-            self.means, sh_dc_of(colour), self.network(values[:, LATENTS.columns], colour),
-            values[:, OPACITY.columns].squeeze(1), *scales_and_quats(shape, size),
+        return plain_gaussians(self.means, values, self.log_edges(self.levels), self.cube, self.network)
+
+    @torch.no_grad()
+    def coded(self) -> Scene:
+        """What the file holds: of a trained model the integers that the training has fixed."""
+        levels, cells = self.cube.settled(self.means, self.levels, self.opacity)
+        values = self.numbers()
+        values[:, SIZE.columns] += (self.log_edges(self.levels) - self.log_edges(levels))[:, None]
+        return Scene(
+            self.cube, levels, cells, values, self.network.layers(), sh_degree=self.network.degree,
+            base_steps=tuple(self.rate.base_steps.tolist()), context=self.rate.exact(),
         )  # fmt: skip
 
     def state_dict_extra(self) -> dict[str, Any]:
-        return {"phase": self.phase, "sharpness": self.sharpness, "jitters": self.jitters, "seed": self.split_seed}
+        modes = {"phase": self.phase, "sharpness": self.sharpness, "jitters": self.jitters}
+        modes |= {"rounds": self.network.rounds}
+        return {**modes, "seed": self.split_seed, "low": list(self.cube.low), "edge": self.cube.edge}
 
     def load_state_dict_extra(self, extra: dict[str, Any]) -> None:
         self.phase, self.sharpness = str(extra["phase"]), float(extra["sharpness"])
         self.jitters, self.split_seed = bool(extra["jitters"]), int(extra["seed"])
-        self.__dict__["_known_edge"] = None
+        self.network.rounds = bool(extra["rounds"])
+        low = [float(x) for x in extra["low"]]
+        self.cube = Cube((low[0], low[1], low[2]), float(extra["edge"]))

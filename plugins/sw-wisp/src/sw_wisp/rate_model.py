@@ -1,30 +1,29 @@
-"""Rate model without context: a mean, a deviation and a step for each number and octree level.
+"""Rate model without context: a mean and a table of the file's Gaussians for each number and octree level.
 
-What is trained is what is coded: means and deviations lie on the lattice of the file's integers (12 fractional bits),
-and the bits of a step in training are those of the file's Gaussian of the same parameters.
+What is trained is what is coded: means and tables are those that the file holds, and the bits of a step in training are
+those of a Gaussian of the table's deviation.
 """
 
 from __future__ import annotations
 
-import math
+import functools
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
-from sw_codecs.entropy.rates import gaussian_bits
-from sw_wisp.numbers import HIGHEST_LEVEL, NUMBERS
+from sw_wisp.nested import UNIT, index_bits
+from sw_wisp.numbers import HIGHEST_LEVEL, LOWEST_LEVEL, NUMBERS
+from sw_wisp.rate import bits, sigma_of
+from sw_wisp.static import ENOUGH, MEAN_UNIT, StaticContext
 
-TOP = 63
-"""Highest table of the file's Gaussians; they are linear in the logarithm of the deviation."""
-NARROWEST, RANGE = 0.05, 1280.0
-"""Deviation of table 0 in steps, and how much wider table 63 is."""
-UNIT = 4096
-"""Integers of the file have 12 fractional bits."""
-LEAST = 2.0**-16
-"""Floor of a probability in the loss."""
-ENOUGH = 64
-"""Splats that a level needs for means and deviations of its own; others share those of all."""
+TABLES = 64
+WINDOW = 255
+"""Indices that are told apart when a table is chosen; those beyond count as the last."""
+LEVELS = HIGHEST_LEVEL - LOWEST_LEVEL + 1
+LARGEST_MEAN = 32767
+"""Of the file, in units of 16/4096 base steps."""
 
 
 @dataclass(frozen=True)
@@ -40,68 +39,69 @@ class Forecast:
     scale: Tensor
     steps: Tensor
 
-    def rows(self, rows: Tensor) -> Forecast:
-        """Return some of the rows."""
-        return Forecast(self.mean[rows], self.scale[rows], self.steps[rows])
 
-
-def deviation(scale: Tensor, steps: Tensor) -> Tensor:
-    """Return standard deviations for table numbers, clamped to 0..63, and quantiser steps; differentiable."""
-    return steps * NARROWEST * torch.exp(scale.clamp(0, TOP) * (math.log(RANGE) / TOP))
-
-
-def scale_of(deviations: Tensor, steps: Tensor) -> Tensor:
-    """Return the table numbers, 0..63 with a fraction, of standard deviations; the inverse of `deviation`."""
-    ratio = (deviations / (steps * NARROWEST)).clamp_min(1e-12)
-    return (ratio.log() * (TOP / math.log(RANGE))).clamp(0, TOP)
+@functools.cache
+def _costs(device: torch.device) -> Tensor:
+    """[511,64]: bits of indices -255..255 under each table."""
+    indices = np.arange(-WINDOW, WINDOW + 1)
+    return torch.from_numpy(index_bits(np.arange(TABLES)[None], indices[:, None])).float().to(device)
 
 
 class StaticRate(nn.Module):
-    """Means, deviations and steps by level; no parameters, `measure` sets them.
+    """Means and tables by level; no parameters, `measure` sets them.
 
-    base_steps      [22]
-    means, scales   [19,22] by level 0..18: mean, and number of the table
+    base_steps      [22] float64 quantiser steps
+    row             [16] int64: which row of the next two serves levels 3..18
+    means           [16,22] int64 in base steps, 12 fractional bits
+    tables          [16,22] int64, 0..63
+    position_bits   [19] bits that a splat's place at each level takes
     """
 
     base_steps: Tensor
+    row: Tensor
     means: Tensor
-    scales: Tensor
+    tables: Tensor
     position_bits: Tensor
 
     def __init__(self, base_steps: Tensor) -> None:
         super().__init__()
-        levels = HIGHEST_LEVEL + 1
-        self.register_buffer("base_steps", base_steps.float())
-        self.register_buffer("means", torch.zeros(levels, NUMBERS))
-        self.register_buffer("scales", torch.full((levels, NUMBERS), 40.0))
-        self.register_buffer("position_bits", 3.0 * torch.arange(levels))
+        self.register_buffer("base_steps", base_steps.double())
+        self.register_buffer("row", torch.zeros(LEVELS, dtype=torch.int64))
+        self.register_buffer("means", torch.zeros(LEVELS, NUMBERS, dtype=torch.int64))
+        self.register_buffer("tables", torch.full((LEVELS, NUMBERS), 40))
+        self.register_buffer("position_bits", torch.full((HIGHEST_LEVEL + 1,), 16.0))
 
     @torch.no_grad()
     def measure(self, values: Tensor, levels: Tensor) -> None:
-        """Take means and deviations of values [N,22] at levels [N], rounded to what the file can say."""
-        count = HIGHEST_LEVEL + 1
-        values = values.double()
-        ones = values.new_zeros(count).index_add_(0, levels, values.new_ones(len(values)))
-        sums = values.new_zeros(count, NUMBERS).index_add_(0, levels, values)
-        squares = values.new_zeros(count, NUMBERS).index_add_(0, levels, values.square())
-        whole = max(len(values), 1)
-        overall, spread = sums.sum(0) / whole, squares.sum(0) / whole
-        own = (ones >= ENOUGH)[:, None]
-        n = ones.clamp_min(1)[:, None]
-        means = torch.where(own, sums / n, overall)
-        variances = torch.where(own, squares / n, spread) - means.square()
-        base = self.base_steps.double()
-        self.means.copy_((means / base * UNIT).round() / UNIT * base)
-        scales = scale_of(variances.clamp_min(0).sqrt(), base)
-        self.scales.copy_((scales * UNIT).round() / UNIT)
+        """Take the means, and for each the table of fewest bits, of values [N,22] at levels [N]."""
+        place = levels - LOWEST_LEVEL
+        counts = torch.bincount(place, minlength=LEVELS)
+        own = (counts >= ENOUGH) | (counts == counts.max())
+        at = torch.arange(LEVELS, device=levels.device)
+        self.row.copy_(((at[:, None] - at).abs() + LEVELS * ~own).argmin(dim=1))
+        served = self.row[place]  # [N]
+        units = values.double() / self.base_steps * UNIT
+        sums = units.new_zeros(LEVELS, NUMBERS).index_add_(0, served, units)
+        whole = torch.bincount(served, minlength=LEVELS).clamp_min(1)[:, None]
+        self.means.copy_((sums / whole / MEAN_UNIT).round().clamp(-LARGEST_MEAN, LARGEST_MEAN) * MEAN_UNIT)
+        k = ((units - self.means[served]) / UNIT).round().long().clamp(-WINDOW, WINDOW) + WINDOW
+        cell = (served[:, None] * NUMBERS + torch.arange(NUMBERS, device=levels.device)) * (2 * WINDOW + 1) + k
+        found = torch.bincount(cell.flatten(), minlength=LEVELS * NUMBERS * (2 * WINDOW + 1))
+        bits = found.view(LEVELS, NUMBERS, -1).float() @ _costs(values.device)  # [16,22,64]
+        self.tables.copy_(bits.argmin(dim=2))
 
     def forecast(self, levels: Tensor) -> Forecast:
         """Predict the numbers of splats at levels [N]."""
-        steps = self.base_steps.expand(len(levels), NUMBERS)
-        return Forecast(self.means[levels], self.scales[levels], steps)
+        row = self.row[levels - LOWEST_LEVEL]
+        means = (self.means * (self.base_steps / UNIT)).float()
+        return Forecast(means[row], self.tables.float()[row], self.base_steps.float().expand(len(levels), NUMBERS))
 
     def rate(self, values: Tensor, forecast: Forecast) -> Tensor:
         """Return the bits [N,22] of the bins around values [N,22]; differentiable in values and forecast."""
-        return gaussian_bits(
-            values, forecast.mean, deviation(forecast.scale, forecast.steps), forecast.steps, p_min=LEAST
-        )
+        return bits(values - forecast.mean, sigma_of(forecast.scale, forecast.steps), forecast.steps)
+
+    def exact(self) -> StaticContext:
+        """Return the same distributions in the integers of the file."""
+        used, row = torch.unique(self.row, return_inverse=True)
+        means, tables = self.means[used].cpu().numpy(), self.tables[used].cpu().numpy()
+        return StaticContext(row.cpu().numpy(), means, tables, np.full(NUMBERS, UNIT, np.int64))

@@ -20,7 +20,9 @@ def soft_round(y: Tensor, sharpness: float) -> Tensor:
     return floor + 0.5 + torch.tanh(sharpness * (y - floor - 0.5)) / (2 * math.tanh(sharpness / 2))
 
 
-def disturbed(values: Tensor, mean: Tensor, steps: Tensor, phase: str, sharpness: float = 1.0, most: float = 8.0) -> Tensor:
+def disturbed(
+    values: Tensor, mean: Tensor, steps: Tensor, phase: str, sharpness: float = 1.0, most: float = 8.0
+) -> Tensor:
     """Return what is drawn, and whose bits are counted, for values [N,C]; differentiable, as far as rounding is.
 
     mean, steps     [N,C] where the lattice of each number has its zero, and how wide its cells are

@@ -1,8 +1,8 @@
 """How much the pictures depend on each splat and on each number of one, over all training views.
 
-Both measures are of the squared error. Removing a splat has an exact price, since a picture is affine in a factor on its
-opacity (but for the clamp of alpha and the stop at opaque pixels). Everything else is the diagonal of the Gauss-Newton
-matrix, from random signs: the square of the gradient of sum(signs x image) has it as its mean.
+Both measures are of the squared error. Removing a splat has an exact price, since a picture is affine in a factor on
+its opacity (but for the clamp of alpha and the stop at opaque pixels). Everything else is the diagonal of the
+Gauss-Newton matrix, from random signs: the square of the gradient of sum(signs x image) has it as its mean.
 """
 
 from __future__ import annotations
@@ -65,7 +65,9 @@ def removal_cost(
                 torch.autograd.grad(result.image[colour].sum(), opacities)  # fills the sums
                 assert result.fragment_grad is not None
                 rise += result.fragment_grad.value[:, 0].double()
-            result = rasterizer.render(replace(inputs, opacities=opacities), camera, RasterOptions(background=background))
+            result = rasterizer.render(
+                replace(inputs, opacities=opacities), camera, RasterOptions(background=background)
+            )
             squared = (result.image - truth).square().sum()
             (slope,) = torch.autograd.grad(squared, opacities)
         rise -= (slope * opacities.detach()).double()

@@ -32,8 +32,9 @@ from splatwizard_core.api import (
 )
 from sw_wisp.config import WispConfig
 from sw_wisp.conversion import converted
+from sw_wisp.cube import Cube
 from sw_wisp.model import WispModel
-from sw_wisp.positions import MARGIN, Root, levels_by_cost, levels_by_size
+from sw_wisp.positions import MARGIN, levels_by_cost, middle_scales
 from sw_wisp.removal import copy_some, unworthy
 from sw_wisp.rounding import FINAL, HARD, NOISE, SOFT
 from sw_wisp.sensitivity import Removal, removal_cost, squared_slopes
@@ -135,6 +136,7 @@ class WispStage(Stage):
         scheduler.register_task(self.when(phases.place), self.place, name="place splats in cells")
         soft = self.when(range(phases.soft, phases.hard))
         scheduler.register_task(soft, self.soften, name="soft rounding")
+        scheduler.register_task(self.when(phases.soft), self.round_network, name="eight bits in the network")
         scheduler.register_task(self.when(phases.hard), self.harden, name="hard rounding")
         measured = self.when(range(phases.noise, phases.freeze, rebuild))
         scheduler.register_task(measured, self.measure, name="measure rate model")
@@ -164,6 +166,10 @@ class WispStage(Stage):
         model.phase = SOFT
         model.sharpness = 1 + (phases.sharpness - 1) * (step - first) / max(last - 1 - first, 1)
 
+    def round_network(self, model: WispModel) -> None:
+        """Compute with the network of the file from here on."""
+        model.network.rounds = True
+
     def harden(self, model: WispModel) -> None:
         """Draw rounded numbers from here on."""
         model.phase = HARD
@@ -180,16 +186,14 @@ class WispStage(Stage):
             self.set_levels(model, cameras, rasterizer, scene.background.to(model.device), str(step))
         self.measure(model)
 
-    def place(
-        self, model: WispModel, cameras: CameraIterator, rasterizer: Rasterizer, scene: Scene, step: int
-    ) -> None:
+    def place(self, model: WispModel, cameras: CameraIterator, rasterizer: Rasterizer, scene: Scene, step: int) -> None:
         """Put every splat at the centre of its cell for good."""
         self.tidy(model)
-        model.set_root(Root.around(model.means))
+        model.cube = Cube.around(model.means)
         with still(model):
             self.set_levels(model, cameras, rasterizer, scene.background.to(model.device), str(step))
-        root = model.root
-        model.means.copy_(root.centres(root.cells(model.means, model.levels), model.levels))
+        model.levels, cells = model.cube.settled(model.means, model.levels, model.opacity)
+        model.means.copy_(model.cube.centres(model.levels, cells))
         model.jitters = False
         self.measure(model)
 
@@ -230,14 +234,13 @@ class WispStage(Stage):
         added = copy_some(model, optimizer, copies, step)
         self.tidy(model)
         if step < self.step_of(self.config.phases.levels[0]):
-            model.set_root(Root.around(model.means, MARGIN))
+            model.cube = Cube.around(model.means, margin=MARGIN)
             with still(model):
                 self.set_levels(model, cameras, rasterizer, background, str(step))
         self.measure(model)
         limited = " (as many as may go: budget.cap is high)" if len(doomed) == int(prune.share * before) else ""
-        log.say(
-            f"removed {len(doomed):,} of {before:,} splats{limited}, {added:,} copies, {bits.mean().item():.1f} bits each"
-        )
+        each = f"{bits.mean().item():.1f} bits each"
+        log.say(f"removed {len(doomed):,} of {before:,} splats{limited}, {added:,} copies, {each}")
         log.scalar("pruned", len(doomed))
         log.scalar("added", added)
 
@@ -256,18 +259,17 @@ class WispStage(Stage):
         self, model: WispModel, views: list[View], rasterizer: Rasterizer, background: Tensor, stream_name: str
     ) -> None:
         """Set the level of every splat by `positions.rule`."""
-        rule, edge = self.config.positions, model.root.edge
-        bounds = rule.level_min, rule.level_max
+        rule, cube = self.config.positions, model.cube
         if rule.rule == "mid":
-            levels = levels_by_size(model.shape.detach(), model.size.detach(), edge, rule.eta, bounds)
+            levels = cube.levels(middle_scales(model.shape.detach(), model.size.detach()), rule.eta)
         else:
             draws = stream(model.split_seed, f"levels/{stream_name}")
             some = [views[i] for i in torch.randperm(len(views), generator=draws)[:SENSITIVE_VIEWS].tolist()]
             slopes = squared_slopes(model, ["means"], some, rasterizer, background, draws)["means"].sum(1)
             cost = self.cost(model, views, rasterizer, background)
             scale = cost.loss / (2 * cost.total_error) * len(views) / len(some)
-            levels = levels_by_cost(slopes.double() * scale, self.price(), edge, rule.eta, bounds)
-        model.levels = levels
+            levels = levels_by_cost(slopes.double() * scale, self.price(), cube.edge, rule.eta)
+        model.levels = levels.clamp(rule.level_min, rule.level_max)
 
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
         """The photometric loss, lambda times the bits of the file over the pixels of a picture, the mean opacity."""
