@@ -19,13 +19,14 @@ from torch import Tensor
 from splatwizard_core.api import BitstreamError
 from sw_codecs.bits.packing import ByteReader
 from sw_codecs.entropy.exact_tables import exact_tables
+from sw_codecs.positions import morton
 from sw_wisp import numbers
 from sw_wisp.cube import Cube, splat_cells
 from sw_wisp.decoded import Decoded
 from sw_wisp.eight_bits import EightBitLayer, pack_layers, unpack_layers
 from sw_wisp.nested import UNIT, Reader, Writer
 from sw_wisp.numbers import GROUPS, NUMBERS
-from sw_wisp.octree import Cells, Shares, file_order, fit_shares
+from sw_wisp.octree import MOST_IN_A_CELL, Cells, Shares, file_order, fit_shares
 from sw_wisp.packets import (
     KINDS,
     MOST_PLANES,
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
     from splatwizard_core.api import ContainerReader, ContainerWriter
 
 CONTEXTS: dict[str, Any] = {StaticContext.kind: StaticContext}
-BYTES_OF_A_ROW = 22 * 4 * 4 + 5 * 8 + 59 * 4
+BYTES_OF_A_ROW = 4 * NUMBERS * 4 + 5 * 8 + 59 * 4
 """Of memory that a decoded splat takes: its integers, its cell, and the Gaussian."""
 MOST_ROWS = 1 << 26
 MOST_LAYERS, WIDEST = 16, 4096
@@ -256,15 +257,15 @@ def _sorted(
     levels: np.ndarray, places: np.ndarray, values: np.ndarray, labels: np.ndarray, subsets: list[int]
 ) -> tuple[np.ndarray, list[Cells]]:
     """Rows of the scene in the order of the file, and the cells of each subset in the order of their bases."""
-    from sw_codecs.positions import morton
-
     cells = Cells(levels, morton.encode(places))
     _, crowd = np.unique(np.stack([levels, cells.codes]), axis=1, return_counts=True)
     order = file_order(levels, places, values[:, 0])
     parts = [order[labels[order] == subset] for subset in subsets]
     rows = np.concatenate([np.empty(0, np.int64), *parts])
-    if crowd.max(initial=0) > 16 or len(rows) != len(levels):
-        raise ValueError("more than 16 splats share a cell (see Cube.settled), or a subset has no packet")
+    if crowd.max(initial=0) > MOST_IN_A_CELL or len(rows) != len(levels):
+        raise ValueError(
+            f"more than {MOST_IN_A_CELL} splats share a cell (see Cube.settled), or a subset has no packet"
+        )
     return rows, [cells.part(part) for part in parts]
 
 

@@ -100,6 +100,9 @@ class Context(Protocol):
     def changed(self, rows: np.ndarray, columns: slice, before: np.ndarray | None, state: State) -> None:
         """Take note that `columns` of splats became known, or finer than `before` [n,c]."""
 
+    def pack(self) -> bytes:
+        """Bytes of the section `networks` that it is read from."""
+
 
 Choose = Callable[[np.ndarray, slice, Prediction], np.ndarray]
 """(rows, columns, prediction) -> indices [n,c] of an encoder."""
