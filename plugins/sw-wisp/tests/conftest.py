@@ -4,3 +4,7 @@ import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
+
+from sw_kit.toy_scene import make, one_thread, plugins, rasterizer, toy
+
+__all__ = ["make", "one_thread", "plugins", "rasterizer", "toy"]

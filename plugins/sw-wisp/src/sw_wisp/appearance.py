@@ -83,8 +83,8 @@ class AppearanceNetwork(nn.Module):
         """Return the network that a file holds. Raises ValueError for layers that do not fit together."""
         (basis, _), (first, first_bias), (last, last_bias) = (layer.floats() for layer in layers)
         outputs, latents = basis.shape
-        hidden = len(first)
-        if first.shape[1] != latents + COLOURS or last.shape != (outputs, hidden) or outputs != 3 * (degree + 2) * degree:
+        hidden, bands = len(first), 3 * degree * (degree + 2)
+        if first.shape[1] != latents + COLOURS or last.shape != (outputs, hidden) or outputs != bands:
             raise ValueError(f"no appearance network has layers {basis.shape}, {first.shape}, {last.shape}")
         network = cls(latents, hidden, degree)
         with torch.no_grad():
@@ -121,7 +121,7 @@ def eight_bits(weight: Tensor) -> Tensor:
     with torch.no_grad():
         exact = weight.double()
         exponents = torch.arange(LOWEST_EXPONENT, HIGHEST_EXPONENT + 1, device=weight.device)
-        units = (2.0**exponents.double())[:, None, None]
+        units = (2.0 ** exponents.double())[:, None, None]
         tried = (exact / units).round().clamp(-LARGEST_WEIGHT, LARGEST_WEIGHT) * units  # [E,out,in]
         best = (tried - exact).square().sum(2).argmin(0)  # [out]
         rounded = tried.gather(0, best[None, :, None].expand(1, -1, weight.shape[1]))[0].to(weight)

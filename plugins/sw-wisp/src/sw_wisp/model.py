@@ -9,10 +9,12 @@ import torch
 from torch import Tensor, nn
 
 from splatwizard_core.api import SH, GaussianInputs, GaussianModel, SplatModel
+from sw_codecs.positions import morton
 from sw_wisp.appearance import AppearanceNetwork, sh_dc_of
 from sw_wisp.cube import Cube
 from sw_wisp.file import Scene
 from sw_wisp.numbers import COLOUR, GROUPS, LATENTS, OPACITY, SHAPE, SIZE
+from sw_wisp.octree import Cells, file_order, position_bits
 from sw_wisp.rate_model import Forecast, StaticRate
 from sw_wisp.rounding import FLOAT, HARD, disturbed
 from sw_wisp.shape import bounded, covariance, scales_and_quats
@@ -128,6 +130,20 @@ class WispModel(SplatModel):
         """Bits [N,22] of the numbers of all splats, or of some rows, as this phase rounds them; differentiable."""
         forecast = self.forecast(rows)
         return self.rate.rate(self._drawn(self.numbers(rows), forecast), forecast)
+
+    @torch.no_grad()
+    def file_order(self) -> Tensor:
+        """Rows [N] int64 in the order of the file."""
+        cells = self.cube.cells(self.means, self.levels)
+        rows = file_order(*(each.cpu().numpy() for each in (self.levels, cells, self.opacity)))
+        return torch.from_numpy(rows).to(self.device)
+
+    @torch.no_grad()
+    def place_bits(self) -> Tensor:
+        """Bits [N] float64 of each splat's place in the octree, by coding them; bits that several need are shared."""
+        levels, cells = self.cube.settled(self.means, self.levels, self.opacity)
+        codes = morton.encode(cells.cpu().numpy())
+        return torch.from_numpy(position_bits(Cells(levels.cpu().numpy(), codes))).to(self.device)
 
     def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
         """All splats, whatever the camera."""

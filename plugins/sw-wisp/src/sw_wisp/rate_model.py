@@ -54,14 +54,12 @@ class StaticRate(nn.Module):
     row             [16] int64: which row of the next two serves levels 3..18
     means           [16,22] int64 in base steps, 12 fractional bits
     tables          [16,22] int64, 0..63
-    position_bits   [19] bits that a splat's place at each level takes
     """
 
     base_steps: Tensor
     row: Tensor
     means: Tensor
     tables: Tensor
-    position_bits: Tensor
 
     def __init__(self, base_steps: Tensor) -> None:
         super().__init__()
@@ -69,7 +67,6 @@ class StaticRate(nn.Module):
         self.register_buffer("row", torch.zeros(LEVELS, dtype=torch.int64))
         self.register_buffer("means", torch.zeros(LEVELS, NUMBERS, dtype=torch.int64))
         self.register_buffer("tables", torch.full((LEVELS, NUMBERS), 40))
-        self.register_buffer("position_bits", torch.full((HIGHEST_LEVEL + 1,), 16.0))
 
     @torch.no_grad()
     def measure(self, values: Tensor, levels: Tensor) -> None:

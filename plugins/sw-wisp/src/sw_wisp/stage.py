@@ -119,9 +119,9 @@ class WispStage(Stage):
         }  # fmt: skip
         rates = {k: math.exp((1 - share) * math.log(p.first) + share * math.log(p.last)) for k, p in plans.items()}
         rates["means"] *= extent
-        if step > self.step_of(self.config.phases.place):
+        if step >= self.step_of(self.config.phases.place):
             rates["means"] = 0.0
-        if step > self.step_of(self.config.phases.freeze):
+        if step >= self.step_of(self.config.phases.freeze):
             rates |= dict.fromkeys(WispModel.NUMBERS, 0.0)
         return rates
 
@@ -186,7 +186,15 @@ class WispStage(Stage):
             self.set_levels(model, cameras, rasterizer, scene.background.to(model.device), str(step))
         self.measure(model)
 
-    def place(self, model: WispModel, cameras: CameraIterator, rasterizer: Rasterizer, scene: Scene, step: int) -> None:
+    def place(
+        self,
+        model: WispModel,
+        optimizer: SplatOptimizer,
+        cameras: CameraIterator,
+        rasterizer: Rasterizer,
+        scene: Scene,
+        step: int,
+    ) -> None:
         """Put every splat at the centre of its cell for good."""
         self.tidy(model)
         model.cube = Cube.around(model.means)
@@ -195,15 +203,17 @@ class WispStage(Stage):
         model.levels, cells = model.cube.settled(model.means, model.levels, model.opacity)
         model.means.copy_(model.cube.centres(model.levels, cells))
         model.jitters = False
+        optimizer.keep_rows(model, model.file_order())
         self.measure(model)
 
-    def freeze(self, model: WispModel) -> None:
-        """Round all numbers for good."""
+    def freeze(self, model: WispModel, optimizer: SplatOptimizer) -> None:
+        """Round all numbers for good; splats take the order of the file, in which those of equal depth are drawn."""
         self.measure(model)
         forecast = model.forecast()
         values = model.numbers()
         values = forecast.mean + forecast.steps * ((values - forecast.mean) / forecast.steps).round()
         model.set_numbers(values)
+        optimizer.keep_rows(model, model.file_order())
         model.phase = FINAL
 
     def prune(
@@ -223,7 +233,7 @@ class WispStage(Stage):
         background = scene.background.to(model.device)
         with still(model):
             cost = self.cost(model, cameras, rasterizer, background)
-            bits = model.bits().sum(1) + model.rate.position_bits[model.levels]
+            bits = model.bits().sum(1) + model.place_bits()
         doomed = unworthy(cost.loss_rise, bits, self.price(), prune.share)
         if len(doomed) == before:
             raise EmptyModel(step)
@@ -281,7 +291,7 @@ class WispStage(Stage):
         if config.loss.opacity and step < self.step_of(config.loss.opacity_stop):
             total = total + config.loss.opacity * result.inputs.opacities.mean()
         price = self.price(step)
-        if price and step <= self.step_of(config.phases.freeze):
+        if price and step < self.step_of(config.phases.freeze):
             n = model.num_rows
             count = max(1, math.ceil(config.rate_term.sample * n))
             rows = torch.randint(n, (count,), device=model.device)
