@@ -1,12 +1,9 @@
 import numpy as np
 import pytest
-import torch
 
 from splatwizard_core.api import BitstreamError
 from sw_codecs.bits.packing import ByteReader
-from sw_wisp import rate
-from sw_wisp.nested import UNIT, index_bits
-from sw_wisp.numbers import BASE_STEPS
+from sw_wisp.nested import UNIT
 from sw_wisp.static import StaticContext
 
 
@@ -31,18 +28,6 @@ def test_rare_levels_take_the_statistics_of_the_nearest():
     levels[:3] = [3, 12, 18]
     context = StaticContext.fitted(levels, units)
     assert context.row[[0, 4, 5, 6, 7, 9, 15]].tolist() == [0, 0, 1, 2, 3, 3, 3]
-
-
-def test_training_estimates_what_tables_cost():
-    levels, units = drawn()
-    context = StaticContext.fitted(levels, units)
-    mean, sigma, step = context.distribution(torch.from_numpy(levels), BASE_STEPS)
-    values = torch.from_numpy(units * (np.array(BASE_STEPS) / UNIT)).float()
-    rounded = ((values - mean) / step).round() * step
-    row = context.row[levels - 3]
-    k = np.rint((units - context.means[row]) / context.multipliers).astype(np.int64)
-    exact = index_bits(context.tables[row], k).sum()
-    assert float(rate.bits(rounded, sigma, step).sum()) == pytest.approx(exact, rel=0.01)
 
 
 def test_damaged_statistics_are_refused():

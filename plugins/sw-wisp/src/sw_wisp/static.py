@@ -6,13 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from splatwizard_core.api import BitstreamError
 from sw_codecs.bits.packing import ByteReader
 from sw_codecs.entropy.exact_tables import LEVELS as TABLES
-from sw_codecs.entropy.exact_tables import exact_tables
 from sw_wisp.nested import UNIT, index_bits
 from sw_wisp.numbers import HIGHEST_LEVEL, LOWEST_LEVEL, NUMBERS
 from sw_wisp.packets import Prediction, State
@@ -67,15 +64,6 @@ class StaticContext:
                 bits = index_bits(np.arange(TABLES)[:, None], distinct) @ times
                 tables[number, column] = bits.argmin()
         return cls(row, means, tables, steps)
-
-    def distribution(self, levels: Tensor, base_steps: Sequence[float]) -> tuple[Tensor, Tensor, Tensor]:
-        """Means, scales and steps [N,22] float32 of splats of these levels [N] in the numbers' units, for training."""
-        row = torch.from_numpy(self.row).to(levels.device)[levels.long() - LOWEST_LEVEL]
-        unit = np.asarray(base_steps, np.float64) / UNIT
-        sigma = exact_tables().scales[self.tables] * self.multipliers * unit
-        found = [torch.from_numpy(each).float().to(levels.device)[row] for each in (self.means * unit, sigma)]
-        steps = torch.from_numpy(self.multipliers * unit).float().to(levels.device)
-        return found[0], found[1], steps.expand_as(found[0])
 
     def predict(self, block: slice, rows: np.ndarray, state: State) -> Prediction:
         """Distributions of the columns `block` of splats `rows`."""
