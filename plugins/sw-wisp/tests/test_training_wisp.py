@@ -4,14 +4,16 @@ import copy
 
 import pytest
 import torch
+from sw_gaussians.ply import export_ply
 from sw_kit import short_training
 from sw_kit.short_training import file_of, psnr
 
 from splatwizard_core.coding.container import ContainerReader
-from splatwizard_core.errors import SceneError
+from splatwizard_core.errors import ConfigError, SceneError
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.runs.config import apply_overrides, resolve
+from splatwizard_core.runs.pretrained import checked_start
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.pipeline import TrainingStopped
 from splatwizard_core.training.scheduler import build_schedulers, format_plan
@@ -209,3 +211,14 @@ def test_rules_of_levels(train, rule):
     assert model.levels.min() >= 3
     assert model.levels.max() <= 18
     assert len(model.levels.unique()) > 1
+
+
+def test_a_file_takes_the_place_of_the_scene_that_the_preset_would_train(plugins, toy, tmp_path):
+    ply = tmp_path / "scene.ply"
+    export_ply(toy.truth, ply)
+    assert resolve(Wisp, "paper", plugins=plugins).pretrained
+    found = checked_start(plugins, resolve(Wisp, "paper", sets={"init": str(ply)}, plugins=plugins))
+    assert found.pretrained == {}
+    asked = resolve(Wisp, "paper", sets={"init": str(ply), "pretrained.iterations": 9}, plugins=plugins)
+    with pytest.raises(ConfigError, match="give one of them"):
+        checked_start(plugins, asked)
