@@ -32,6 +32,7 @@ REQUESTS = {
         scores=(ScoreSpec("h", "hits", rule="tested"), ScoreSpec("g", "gamma", rule="tested"))
     ),
     "grad_sq (Speedy-Splat)": RasterOptions(scores=(ScoreSpec("s", "grad_sq"),), clamp_grad="pass"),
+    "removal": RasterOptions(scores=(ScoreSpec("d", "removal"),)),
     "Fisher (PUP)": RasterOptions(fisher=True, clamp_grad="pass"),
 }
 

@@ -11,11 +11,11 @@ from result_records import SmallRecord
 PLY_BYTES = 248  # of a Gaussian in a float32 .ply of SH degree 3
 BASE = "3dgs"
 TITLES = {
-    "3dgs": "3DGS", "trimming-the-fat": "Trimming the Fat", "pup-3dgs": "PUP-3DGS", "speedy-splat": "Speedy-Splat",
-    "lightgaussian": "LightGaussian", "chimerags": "ChimeraGS", "hac": "HAC", "hac-plus": "HAC++",
-    "cat-3dgs": "CAT-3DGS", "mesongs": "MesonGS", "c3dgs": "C3DGS", "compact3dgs": "Compact3DGS", "2dgs": "2DGS",
-    "flat-3dgs": "flat 3DGS", "trim-3dgs": "Trim3DGS", "trim-2dgs": "Trim2DGS",
-    "trim-2dgs-scratch": "Trim2DGS, scratch",
+    "3dgs": "3DGS", "pruned-3dgs": "3DGS, pruned", "trimming-the-fat": "Trimming the Fat", "pup-3dgs": "PUP-3DGS",
+    "speedy-splat": "Speedy-Splat", "lightgaussian": "LightGaussian", "chimerags": "ChimeraGS", "hac": "HAC",
+    "hac-plus": "HAC++", "cat-3dgs": "CAT-3DGS", "mesongs": "MesonGS", "c3dgs": "C3DGS",
+    "compact3dgs": "Compact3DGS", "2dgs": "2DGS", "flat-3dgs": "flat 3DGS", "trim-3dgs": "Trim3DGS",
+    "trim-2dgs": "Trim2DGS", "trim-2dgs-scratch": "Trim2DGS, scratch",
 }  # fmt: skip
 NONE = "-"
 

@@ -32,8 +32,8 @@ def decode(data: bytes, unzstd: Callable[[bytes], bytes], tables: ExactTables) -
     if header["method"] == "compact3dgs":
         return compact(static, sections, unzstd)
     known = (
-        "trimming-the-fat", "pup-3dgs", "speedy-splat", "lightgaussian", "c3dgs", "mesongs", "2dgs",
-        "flat-3dgs", "trim-3dgs", "trim-2dgs", "trim-2dgs-scratch",
+        "pruned-3dgs", "trimming-the-fat", "pup-3dgs", "speedy-splat", "lightgaussian", "c3dgs", "mesongs",
+        "2dgs", "flat-3dgs", "trim-3dgs", "trim-2dgs", "trim-2dgs-scratch",
     )  # fmt: skip
     check(header["method"] in known, "method")
     if static["codec"] == "gaussians-indexed":

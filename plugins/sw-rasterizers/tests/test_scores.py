@@ -29,7 +29,11 @@ MANY = RasterCase("many", n=1000, width=75, height=50, spread=2.0, scale=(0.01, 
 FEW = RasterCase("few", n=6, width=18, height=7, spread=0.7, scale=(0.2, 0.6), opacity=(0.5, 0.98))
 """Small enough for the oracle's Fisher blocks: a pass of autograd for each of 378 values."""
 ALL = [ScoreSpec(kind, kind) for kind in scoring.KINDS]
-TESTED = [ScoreSpec(f"{kind} tested", kind, rule="tested", gamma=0.3) for kind in scoring.KINDS if kind != "grad_sq"]
+TESTED = [
+    ScoreSpec(f"{kind} tested", kind, rule="tested", gamma=0.3)
+    for kind in scoring.KINDS
+    if kind not in ("grad_sq", "removal")
+]
 
 
 @pytest.fixture
@@ -53,6 +57,11 @@ def test_scores_of_many_splats_equal_the_reference_in_float64(specs, options):
     weight = torch.rand(50, 75, generator=generator, dtype=torch.float64)
     specs = [*specs, replace(specs[3], name="weighted", pixel_weight=weight), replace(specs[0], name="masked",
              pixel_weight=weight > 0.5), replace(ScoreSpec("g", "grad_sq"), pixel_weight=weight)]  # fmt: skip
+    residual = torch.rand(3, 50, 75, generator=generator, dtype=torch.float64) - 0.5
+    specs += [
+        ScoreSpec("cost", "removal", residual=residual),
+        ScoreSpec("cost of half", "removal", residual=residual / 2),
+    ]
     background = torch.rand(3, 50, 75, generator=generator, dtype=torch.float64)
     opt = RasterOptions(scores=tuple(specs), background=background, **options)
     found, expected = (r.render(g, cam, opt) for r in (StandardRasterizer(), ReferenceRasterizer()))
@@ -185,6 +194,9 @@ def test_nothing_to_score():
 def test_requests_that_make_no_sense_are_refused():
     g, cam = draw_scene(replace(MANY, n=5), 1, torch.float32)
     for spec in (ScoreSpec("a", "hits", rule="maybe"), ScoreSpec("a", "grad_sq", rule="tested"),
+                 ScoreSpec("a", "removal", rule="tested"), ScoreSpec("a", "removal", torch.ones(50, 75)),
+                 ScoreSpec("a", "removal", residual=torch.ones(3, 5, 5)),
+                 ScoreSpec("a", "hits", residual=torch.ones(3, 50, 75)),
                  ScoreSpec("a", "blend", torch.ones(3, 3))):  # fmt: skip
         for rasterizer in (StandardRasterizer(), ReferenceRasterizer()):
             with pytest.raises(ConfigError, match="score 'a'"):
@@ -193,8 +205,8 @@ def test_requests_that_make_no_sense_are_refused():
         StandardRasterizer().render(g, cam, RasterOptions(scores=(ScoreSpec("a", "hits"), ScoreSpec("a", "blend"))))
     with pytest.raises(CapabilityError, match="ANTIALIAS and FISHER"):
         StandardRasterizer().render(g, cam, RasterOptions(fisher=True, antialias=True))
-    many = tuple(ScoreSpec(str(k), "hits") for k in range(17))
-    with pytest.raises(CapabilityError, match="at most 16"):
+    many = tuple(ScoreSpec(str(k), "hits") for k in range(33))
+    with pytest.raises(CapabilityError, match="at most 32"):
         StandardRasterizer().accumulate(g, [cam], RasterOptions(scores=many))
 
 

@@ -24,7 +24,11 @@ MANY = RasterCase("many", n=3000, width=203, height=150, spread=2.0, scale=(0.01
 """Fills 13 x 10 tiles, the last ones partial, with lists longer than a stage of the kernels."""
 FEW = RasterCase("few", n=6, width=18, height=7, spread=0.7, scale=(0.2, 0.6), opacity=(0.5, 0.98))
 ALL = [ScoreSpec(kind, kind) for kind in scoring.KINDS]
-TESTED = [ScoreSpec(f"{kind} tested", kind, rule="tested", gamma=0.3) for kind in scoring.KINDS if kind != "grad_sq"]
+TESTED = [
+    ScoreSpec(f"{kind} tested", kind, rule="tested", gamma=0.3)
+    for kind in scoring.KINDS
+    if kind not in ("grad_sq", "removal")
+]
 
 
 def relative(found, expected):
@@ -44,6 +48,7 @@ def test_scores_of_many_splats_equal_the_kernels_of_the_cpu(specs, changes):
         ScoreSpec("weighted", "blend", weight),
         ScoreSpec("masked", "hits", weight > 0.5),
         ScoreSpec("squares", "grad_sq", weight),
+        ScoreSpec("cost", "removal", residual=torch.rand(3, cam.height, cam.width, generator=generator) - 0.5),
     ]
     background = torch.rand(3, cam.height, cam.width, generator=generator)
     opt = RasterOptions(scores=tuple(specs), background=background, **changes)
@@ -114,7 +119,7 @@ def test_scores_are_formed_by_the_rasterizer_that_draws():
     rasterizer = NegotiatedRasterizer(load_plugins(), device="cuda")
     g, cam = draw_scene(FEW, 1, torch.float32)
     moved = cast_inputs(g, device="cuda")
-    for spec in ("opacity_T", "grad_sq", "blend"):
+    for spec in ("opacity_T", "grad_sq", "removal", "blend"):
         rasterizer.accumulate(moved, [cam], RasterOptions(scores=(ScoreSpec("s", spec),)))
     rasterizer.accumulate(moved, [cam], RasterOptions(fisher=True))
     assert set(rasterizer.choices.values()) == {"standard"}

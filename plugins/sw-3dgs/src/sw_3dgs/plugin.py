@@ -1,4 +1,4 @@
-"""Registers the method 3dgs."""
+"""Registers the methods 3dgs and pruned-3dgs."""
 
 from splatwizard_core.api import Registry, hookimpl
 
@@ -10,3 +10,6 @@ def register_methods(registry: Registry) -> None:
                  default=True, presets=["paper", "inria", "inria2024", "absgrad", "mcmc", "fast", "fast-cpu", "quick"],
                  rates=["r1", "r2", "r3", "r4", "r5", "r6"], bd_anchor=3,
                  published="sw_3dgs:published.toml")  # fmt: skip
+    registry.add("pruned-3dgs", "sw_3dgs.pruned:Pruned3DGS", title="3DGS, pruned",
+                 summary="a trained 3DGS scene with as many Gaussians as asked for, by the exact cost of removal",
+                 presets=["paper", "quick"], rates=["r1", "r2", "r3", "r4", "r5"])  # fmt: skip

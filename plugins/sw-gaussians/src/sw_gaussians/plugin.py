@@ -62,6 +62,8 @@ def register_tasks(registry: Registry) -> None:
 @hookimpl
 def register_pruners(registry: Registry) -> None:
     registry.add("opacity", "sw_gaussians.pruners:Opacity", summary="keeps what is opaque; looks at no view")
+    registry.add("removal", "sw_gaussians.removal:Removal",
+                 summary="keeps what the photographs lose most by removing: exact squared error")  # fmt: skip
 
 
 @hookimpl

@@ -4,7 +4,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from sw_gaussians.finetune.pruning import PruneByScore, lowest, removal_count, scores_of, up_to
+from sw_gaussians.finetune.pruning import PruneByScore, PruneToCount, lowest, removal_count, scores_of, up_to
 
 from splatwizard_core.errors import EmptyModel, ShapeError
 from splatwizard_core.gaussians.model import GaussianModel
@@ -61,6 +61,34 @@ def test_the_lowest_go_and_of_equals_the_first(values, count):
 def test_a_nan_is_no_score():
     with pytest.raises(ValueError, match="not a number"):
         lowest(torch.tensor([1.0, float("nan")]), 1)
+
+
+def test_a_pruner_that_compares_with_photographs_gets_the_views(scene):
+    class Comparing(Fixed):
+        score_views = Fixed.score
+
+        def score(self, *args):
+            raise AssertionError("there are photographs")
+
+    pruner = Comparing(torch.arange(10.0))
+    scores_of(pruner, model(), CameraIterator(scene.train), None, scene)
+    assert pruner.seen[0] == scene.train
+
+
+def test_rounds_remove_equal_shares_until_the_count_is_left(scene):
+    n, counts = 10_000, []
+    task = PruneToCount(Fixed(None), [5, 9, 20], 1_250)
+    for step in (5, 9, 20):
+        n -= int(task.doomed(torch.arange(float(n)), step).sum())
+        counts.append(n)
+    assert counts == [5_000, 2_500, 1_250]
+    assert not task.doomed(torch.arange(1_250.0), 20).any()
+    assert not task.doomed(torch.arange(7.0), 9).any()  # fewer than are asked for
+    only = PruneToCount(Fixed(torch.arange(10.0)), [3], 4)
+    gaussians = model()
+    optimizer = SplatOptimizer(gaussians, [ParamGroup("means", 1e-3)])
+    only(gaussians, optimizer, CameraIterator(scene.train), None, scene, 3, TaskLog())
+    assert gaussians.num_rows == 4
 
 
 def test_the_task_removes_rows_and_moments_and_sees_every_camera_once(scene):

@@ -12,12 +12,13 @@ STANDARD_FEATURES = [
 ]  # fmt: skip
 
 SCORES = [
-    "SCORE_HITS", "SCORE_OPACITY", "SCORE_OPACITY_T", "SCORE_BLEND", "SCORE_BLEND_MAX", "SCORE_GAMMA", "SCORE_DIST",
-    "SCORE_PIXEL_WEIGHT", "SCORE_GRAD_SQ", "FISHER",
+    "SCORE_HITS", "SCORE_OPACITY", "SCORE_OPACITY_T", "SCORE_BLEND", "SCORE_BLEND_SQ", "SCORE_BLEND_MAX",
+    "SCORE_SHOWN", "SCORE_GAMMA", "SCORE_DIST", "SCORE_PIXEL_WEIGHT", "SCORE_GRAD_SQ", "SCORE_REMOVAL", "FISHER",
 ]  # fmt: skip
 # A derivative of three colours, without that of the antialias factor; log scales need scales.
 SCORES_FORBIDDEN = [
-    ["COLORS_ND", "SCORE_GRAD_SQ"], ["COLORS_ND", "FISHER"], ["ANTIALIAS", "FISHER"], ["COV3D", "FISHER"],
+    ["COLORS_ND", "SCORE_GRAD_SQ"], ["COLORS_ND", "SCORE_REMOVAL"], ["COLORS_ND", "FISHER"], ["ANTIALIAS", "FISHER"],
+    ["COV3D", "FISHER"],
 ]  # fmt: skip
 ALIASES = ["accel", "depth", "count", "speedy", "pup", "mesongs", "trimgs"]
 """Rasterizers of papers whose additions `standard` has: Taming 3DGS, hierarchical 3DGS, LightGaussian, Speedy-Splat,

@@ -9,9 +9,11 @@ from splatwizard_core.api import AccumOutput, CapabilityError, GaussianInputs, R
 from sw_rasterizers.native import MODULE
 from sw_rasterizers.ops import Call
 
-KINDS = ("hits", "opacity", "opacity_T", "blend", "blend_max", "gamma", "dist", "grad_sq")
+KINDS = (
+    "hits", "opacity", "opacity_T", "blend", "blend_max", "gamma", "dist", "blend_sq", "shown", "grad_sq", "removal",
+)  # fmt: skip
 """Score kinds, in the order of `enum ScoreKind` in csrc/scores.h."""
-MAX_SCORES = 16
+MAX_SCORES = 32
 """Largest number of scores per call; `kMaxScores` of csrc/scores.h."""
 FISHER = 21
 """Length of a Fisher block: upper triangle of 6x6, row by row."""
@@ -68,11 +70,12 @@ def add_scores(g: GaussianInputs, call: Call, opt: RasterOptions, totals: Totals
 
 
 def _pixel_weights(specs: tuple[ScoreSpec, ...], like: Tensor) -> tuple[Tensor | None, list[int]]:
-    """Return pixel-weight maps [M,H,W], and the map index per score; -1: none."""
+    """Return pixel-weight maps [M,H,W], and the map index per score (first of a residual's three); -1: none."""
     maps: list[Tensor] = []
     rows = []
     for spec in specs:
-        rows.append(-1 if spec.pixel_weight is None else len(maps))
-        if spec.pixel_weight is not None:
-            maps.append(spec.pixel_weight.detach().to(like))
+        given = spec.pixel_weight if spec.residual is None else spec.residual
+        rows.append(-1 if given is None else len(maps))
+        if given is not None:
+            maps.extend(given.detach().to(like).reshape(-1, *given.shape[-2:]))
     return (torch.stack(maps).contiguous() if maps else None), rows

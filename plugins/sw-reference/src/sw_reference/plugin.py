@@ -15,15 +15,17 @@ def register_rasterizers(registry: Registry) -> None:
             "BACKWARD", "ANTIALIAS", "ABSGRAD", "VISIBLE_FILTER", "COV3D", "COLORS_ND", "EXTRA_FEATURES",
             "SPLIT_SH", "INDEXED_SH", "INDEXED_GEOM", "NO_COLOR_CLAMP", "DEPTH_INVERSE", "DEPTH_ACCUM",
             "DEPTH_EXPECTED", "DEPTH_MEDIAN", "ALPHA_MAP", "SCORE_HITS", "SCORE_OPACITY", "SCORE_OPACITY_T",
-            "SCORE_BLEND", "SCORE_BLEND_MAX", "SCORE_GAMMA", "SCORE_DIST", "SCORE_PIXEL_WEIGHT",
-            "SCORE_GRAD_SQ", "FISHER", "FLOAT64", "SURFEL", "NORMALS", "DISTORTION", "DETERMINISTIC",
+            "SCORE_BLEND", "SCORE_BLEND_SQ", "SCORE_BLEND_MAX", "SCORE_SHOWN", "SCORE_GAMMA", "SCORE_DIST",
+            "SCORE_PIXEL_WEIGHT", "SCORE_GRAD_SQ", "SCORE_REMOVAL", "FISHER", "FLOAT64", "SURFEL", "NORMALS",
+            "DISTORTION", "DETERMINISTIC",
         ],
         # Surfels have a low-pass of their own, and the scores are those of ellipsoids.
         combos_forbidden=[
             ["SURFEL", other]
             for other in (
                 "ANTIALIAS", "ABSGRAD", "SCORE_HITS", "SCORE_OPACITY", "SCORE_OPACITY_T", "SCORE_BLEND",
-                "SCORE_BLEND_MAX", "SCORE_GAMMA", "SCORE_DIST", "SCORE_GRAD_SQ", "FISHER",
+                "SCORE_BLEND_SQ", "SCORE_BLEND_MAX", "SCORE_SHOWN", "SCORE_GAMMA", "SCORE_DIST", "SCORE_GRAD_SQ",
+                "SCORE_REMOVAL", "FISHER",
             )
         ] + [["COV3D", "FISHER"]],
         profiles=["3dgs", "dgr-exact"],

@@ -40,11 +40,14 @@ class Feature(enum.Flag):
     SCORE_OPACITY = enum.auto()
     SCORE_OPACITY_T = enum.auto()
     SCORE_BLEND = enum.auto()
+    SCORE_BLEND_SQ = enum.auto()
     SCORE_BLEND_MAX = enum.auto()
+    SCORE_SHOWN = enum.auto()
     SCORE_GAMMA = enum.auto()
     SCORE_DIST = enum.auto()
     SCORE_PIXEL_WEIGHT = enum.auto()
     SCORE_GRAD_SQ = enum.auto()
+    SCORE_REMOVAL = enum.auto()
     FISHER = enum.auto()
     TIGHT_TILES = enum.auto()
     FLOAT64 = enum.auto()
@@ -94,10 +97,9 @@ _DEPTHS = {
     "inverse": Feature.DEPTH_INVERSE, "accumulated": Feature.DEPTH_ACCUM, "expected": Feature.DEPTH_EXPECTED,
     "median": Feature.DEPTH_MEDIAN,
 }  # fmt: skip
-_SCORES = {
-    kind: Feature[f"SCORE_{kind.upper()}"]
-    for kind in ("hits", "opacity", "opacity_T", "blend", "blend_max", "gamma", "dist", "grad_sq")
-}
+_SCORES = {kind: Feature[f"SCORE_{kind.upper()}"] for kind in (
+    "hits", "opacity", "opacity_T", "blend", "blend_sq", "blend_max", "shown", "gamma", "dist", "grad_sq", "removal",
+)}  # fmt: skip
 
 
 @functools.cache

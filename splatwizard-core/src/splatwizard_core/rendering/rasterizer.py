@@ -20,10 +20,12 @@ class ScoreSpec:
     """One per-Gaussian sum over pixels (and views) that a rasterizer should return.
 
     name            key in RenderResult.scores
-    kind            "hits", "opacity", "opacity_T", "blend", "blend_max", "gamma", "dist", "grad_sq"
-    pixel_weight    optional [H,W] float or bool factor per pixel
-    rule            "blended", or "tested": also the splat that triggers the stop ("grad_sq" knows only the first)
+    kind            "hits", "opacity", "opacity_T", "blend", "blend_sq", "blend_max", "shown", "gamma", "dist",
+                    "grad_sq", "removal"
+    pixel_weight    optional [H,W] float or bool factor per pixel; not of "removal"
+    rule            "blended", or "tested": also the splat that triggers the stop (not of "grad_sq" and "removal")
     gamma           exponent of kind "gamma": alpha^(2g) T^(2-2g)
+    residual        of "removal": optional [3,H,W], render minus picture; without it the picture is the render itself
     """
 
     name: str
@@ -31,12 +33,13 @@ class ScoreSpec:
     pixel_weight: Tensor | None = None
     rule: str = "blended"
     gamma: float = 0.5
+    residual: Tensor | None = None
 
     @property
     def dtype(self) -> torch.dtype:
         """int32 for counts (also under a mask), float32 for everything else."""
         whole = self.pixel_weight is None or not self.pixel_weight.is_floating_point()
-        return torch.int32 if self.kind == "hits" and whole else torch.float32
+        return torch.int32 if self.kind in ("hits", "shown") and whole else torch.float32
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,18 +77,19 @@ class RasterOptions:
     dtype_out: str = "float32"
 
     def check_scores(self, cam: Camera) -> None:
-        """Raise ConfigError for an unknown rule, a pixel weight not [H,W] of `cam`, or two scores of one name."""
+        """Raise ConfigError for an unknown rule, a map not of the size of `cam` or the kind, two scores of one name."""
         for spec in self.scores:
-            rules = ("blended",) if spec.kind == "grad_sq" else ("blended", "tested")
+            rules = ("blended",) if spec.kind in ("grad_sq", "removal") else ("blended", "tested")
             if spec.rule not in rules:
                 raise ConfigError(
                     f"score '{spec.name}': rule is '{spec.rule}', must be {' or '.join(map(repr, rules))}"
                 )
-            if spec.pixel_weight is not None and spec.pixel_weight.shape != (cam.height, cam.width):
-                raise ConfigError(
-                    f"score '{spec.name}': pixel_weight is {list(spec.pixel_weight.shape)}, "
-                    f"must be [{cam.height}, {cam.width}]"
-                )
+            for name, leading in (("pixel_weight", ()), ("residual", (3,))):
+                given, size = getattr(spec, name), (*leading, cam.height, cam.width)
+                if given is not None and (name == "residual") != (spec.kind == "removal"):
+                    raise ConfigError(f"score '{spec.name}': kind '{spec.kind}' takes no {name}")
+                if given is not None and given.shape != size:
+                    raise ConfigError(f"score '{spec.name}': {name} is {list(given.shape)}, must be {list(size)}")
         if len({s.name for s in self.scores}) < len(self.scores):
             raise ConfigError(f"two scores have one name: {', '.join(s.name for s in self.scores)}")
 

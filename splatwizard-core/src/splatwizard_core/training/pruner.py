@@ -16,6 +16,7 @@ class Pruner(Protocol):
     """Scores primitives; the caller decides how many are removed.
 
     What is registered is a class whose settings all have defaults, so that any method can use any pruner.
+    One that needs photographs also has `score_views(model, views, rasterizer, background)`, called in place of `score`.
 
     uses_statistics     the score reads the model's screen-space gradient statistics (`grad_accum`, `denom`): whoever
                         uses this pruner has them collected in the steps before

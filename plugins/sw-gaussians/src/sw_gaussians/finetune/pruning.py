@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import torch
@@ -89,16 +89,37 @@ class PruneByScore:
         log: TaskLog,
     ) -> None:
         scores = scores_of(self.pruner, model, cameras, rasterizer, scene)
-        fraction = self.fractions[step] if isinstance(self.fractions, Mapping) else self.fractions
         before = model.num_rows
-        official = self.count_rule == "official"
-        doomed = up_to(scores, fraction) if official else lowest(scores, removal_count(before, fraction))
+        doomed = self.doomed(scores, step)
         left = before - int(doomed.sum())
         if left == 0:
             raise EmptyModel(step)
         optimizer.keep_rows(model, ~doomed, carry_grad=self.carry_grad)
         log.say(f"removed {before - left:,} of {before:,} primitives, {left:,} left")
         log.scalar("pruned", before - left)
+
+    def doomed(self, scores: Tensor, step: int) -> Tensor:
+        """Return [N] bool: what goes at this step, by `scores` [N]."""
+        fraction = self.fractions[step] if isinstance(self.fractions, Mapping) else self.fractions
+        if self.count_rule == "official":
+            return up_to(scores, fraction)
+        return lowest(scores, removal_count(len(scores), fraction))
+
+
+class PruneToCount(PruneByScore):
+    """Schedule task: remove the lowest in several rounds, an equal share in each, until `count` primitives are left.
+
+    steps   of the rounds, ascending; a round takes what is left to take by the ones from it on
+    """
+
+    def __init__(self, pruner: Pruner, steps: Sequence[int], count: int, *, carry_grad: bool = False) -> None:
+        super().__init__(pruner, 0.0, carry_grad=carry_grad)
+        self.steps, self.count = tuple(steps), count
+
+    def doomed(self, scores: Tensor, step: int) -> Tensor:
+        n, rounds = len(scores), sum(at >= step for at in self.steps)
+        left = round(n * (self.count / n) ** (1 / rounds)) if n > self.count else n
+        return lowest(scores, n - left)
 
 
 @torch.no_grad()
@@ -107,10 +128,15 @@ def scores_of(
 ) -> Tensor:
     """Return one score per row of the model, [N], rendered on the evaluation background.
 
-    Raises ShapeError or ValueError for what cannot be scores.
+    A pruner with `score_views` gets the views, pictures included; any other their cameras. Raises ShapeError or
+    ValueError for what cannot be scores.
     """
     background = scene.background.to(model.device)
-    scores = pruner.score(model, [view.camera for view in cameras], rasterizer, background)
+    score_views = getattr(pruner, "score_views", None)
+    if score_views is not None:
+        scores = score_views(model, cameras, rasterizer, background)
+    else:
+        scores = pruner.score(model, [view.camera for view in cameras], rasterizer, background)
     name = type(pruner).__name__
     if scores.shape != (model.num_rows,):
         raise ShapeError(

@@ -68,12 +68,12 @@ void accumulate_as(const Inputs& in, const ScoreInputs& asked, at::ArrayRef<doub
   canvas.background_is_image = in.background.has_value() && in.background->dim() == 3;
   canvas.transmittance = data<S>(transmittance), canvas.last = data<int32_t>(last);
   SW_SELECT(blend<S>)(view, settings, slots, pairs, canvas);
-  const Scores<S> squares = asked.select<S>(true, to);
-  if (squares.count > 0) {
-    const Sensitivity<S> what{false, &squares};
+  const Scores<S> sensitive_scores = asked.select<S>(true, to);
+  if (sensitive_scores.count > 0) {
+    const Sensitivity<S> what{false, &sensitive_scores};
     const Tensor sums = make({count, what.columns()});
     SW_SELECT(sensitivity_pairs<S>)(view, settings, slots, pairs, canvas, what, data<S>(sums));
-    SW_SELECT(add_scores<S>)(n, settings, slots, squares, data<S>(sums), to);
+    SW_SELECT(add_scores<S>)(n, settings, slots, sensitive_scores, data<S>(sums), to);
   }
   if (fisher) {
     const Sensitivity<S> what{true, nullptr};
@@ -103,8 +103,8 @@ void accumulate_scores(const Tensor& means, const Tensor& opacities, const Optio
 }  // namespace
 
 TORCH_LIBRARY_FRAGMENT(sw_rasterizers, m) {
-  // kinds: enum ScoreKind; rules: 1 tested, 0 blended; weight_rows: which of `weights` [M,H,W], or -1. Adds to `totals`
-  // [scores, N] and `blocks` [N, 21], both float64, and so may be called for one view after another.
+  // kinds: enum ScoreKind; rules: 1 tested, 0 blended; weight_rows: which of `weights` [M,H,W], of a
+  // removal the first of its residual's three, or -1. Adds to `totals` [scores, N] and `blocks` [N, 21], both float64, and so may be called for one view after another.
   m.def(
       "accumulate_scores(Tensor means, Tensor opacities, Tensor? scales, Tensor? quats, Tensor? cov3d, Tensor? sh, "
       "Tensor? sh_dc, Tensor? sh_rest, Tensor? colors, Tensor? visible, Tensor? background, float[] camera, int width, "

@@ -31,10 +31,11 @@ struct ScoreInputs {
                 "sw_rasterizers: totals and blocks must be float64");
     const int64_t maps = weights.has_value() ? weights->size(0) : 0;
     for (int64_t s = 0; s < count; ++s)
-      TORCH_CHECK(kinds[s] >= kHits && kinds[s] <= kGradSq && weight_rows[s] >= -1 && weight_rows[s] < maps,
+      TORCH_CHECK(kinds[s] >= kHits && kinds[s] <= kRemoval && weight_rows[s] >= -1 &&
+                      weight_rows[s] + (kinds[s] == kRemoval && weight_rows[s] >= 0 ? 3 : 1) <= maps,
                   "sw_rasterizers: score ", s, " is malformed");
     TORCH_CHECK(!wants_sensitivity() || in.channels().colors == 3,
-                "sw_rasterizers: grad_sq and Fisher blocks need 3 colour channels, got ", in.channels().colors);
+                "sw_rasterizers: grad_sq, removal and Fisher blocks need 3 colour channels, got ", in.channels().colors);
     TORCH_CHECK(!blocks.has_value() || (in.scales.has_value() && !(in.flags & kAntialias)),
                 "sw_rasterizers: Fisher blocks need scales and no antialiasing");
     TORCH_CHECK(!in.background.has_value() || in.background->device() == in.means.device(),
@@ -43,16 +44,16 @@ struct ScoreInputs {
 
   bool wants_sensitivity() const {
     bool found = blocks.has_value();
-    for (const int64_t kind : kinds) found |= kind == kGradSq;
+    for (const int64_t kind : kinds) found |= is_sensitive(int(kind));
     return found;
   }
 
   // Those of one family, and where each is added to.
   template <class S>
-  Scores<S> select(bool grad_sq, double** to) const {
+  Scores<S> select(bool sensitive, double** to) const {
     Scores<S> out;
     for (size_t s = 0; s < kinds.size(); ++s) {
-      if ((kinds[s] == kGradSq) != grad_sq) continue;
+      if (is_sensitive(int(kinds[s])) != sensitive) continue;
       const S* map = nullptr;
       if (weight_rows[s] >= 0) map = data<S>(weights) + weight_rows[s] * weights->size(1) * weights->size(2);
       to[out.count] = data<double>(totals) + int64_t(s) * totals.size(1);

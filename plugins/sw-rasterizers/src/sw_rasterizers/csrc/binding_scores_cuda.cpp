@@ -70,8 +70,8 @@ void accumulate_scores(const Tensor& means, const Tensor& opacities, const Optio
   image.background_is_image = in.background.has_value() && in.background->dim() == 3;
   image.transmittance = data<float>(saved[kTransmittance]), image.last = data<int32_t>(saved[kLast]);
   const bool pass_clamp = flags & kPassClamp;
-  const Scores<float> squares = asked.select<float>(true, to.of);
-  if (squares.count > 0) square_derivatives(view, pass_clamp, splats, lists, image, squares, to, ordered, stream);
+  const Scores<float> sensitive = asked.select<float>(true, to.of);
+  if (sensitive.count > 0) sensitivity_scores(view, pass_clamp, splats, lists, image, sensitive, to, ordered, stream);
   if (blocks.has_value()) {
     const int64_t used = saved[kShape].size(0);
     const Tensor rows = at::zeros({used, kFisherSums}, means.options().requires_grad(false));

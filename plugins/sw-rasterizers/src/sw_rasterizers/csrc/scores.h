@@ -3,9 +3,12 @@
 //
 // Over the pairs of a pixel and a splat that is blended there (rule "tested": also where it stops the pixel), o the
 // effective opacity, T the transmittance in front:
-//   hits 1, opacity o, opacity_T o T, blend alpha T, blend_max its maximum, gamma alpha^(2g) T^(2-2g), dist |d|,
+//   hits 1, opacity o, opacity_T o T, blend alpha T, blend_max its maximum, blend_sq its square, shown 1 where
+//   alpha T > 1/255, gamma alpha^(2g) T^(2-2g), dist |d|,
 //   grad_sq (o dL/dalpha)^2 for L = sum of all pixels and channels (Speedy-Splat, arXiv 2412.00578)
-// each times the pixel's weight, if there is one. The constant factor o is multiplied in at the end.
+// each times the pixel's weight, if there is one. The constant factor o is multiplied in at the end. And
+//   removal  sum over channels of d (d + 2 r), d = -alpha d image_c / d alpha, r = image_c less the picture: what the
+//            squared error changes by if the splat is not drawn, since the image is affine in each alpha
 //
 // Fisher block of theta = (mean, log scale), F = sum over pixels and channels of g g^T, g = d image_c / d theta
 // (PUP 3D-GS, arXiv 2406.10219), factorised: with v_c = d image_c / d sigma, w = alpha T and
@@ -18,16 +21,21 @@
 
 namespace sw {
 
-enum ScoreKind { kHits, kOpacity, kOpacityT, kBlend, kBlendMax, kGamma, kDist, kGradSq };  // mirrored in scoring.py
+// Mirrored in scoring.py. Those from kGradSq on depend on the light behind a splat.
+enum ScoreKind {
+  kHits, kOpacity, kOpacityT, kBlend, kBlendMax, kGamma, kDist, kBlendSq, kShown, kGradSq, kRemoval
+};
 
-constexpr int kMaxScores = 16;  // of one call
+constexpr int kMaxScores = 32;  // of one call; a lane of a warp each
+constexpr double kShownMin = 1.0 / 255;
+SW_HD constexpr bool is_sensitive(int kind) { return kind >= kGradSq; }
 
 template <class S>
 struct Score {
   int kind;
   bool tested;      // rule
   S gamma;          //
-  const S* weight;  // [H][W], or null
+  const S* weight;  // [H][W], of kRemoval the residual [3][H][W], or null
 };
 
 template <class S>
@@ -35,6 +43,17 @@ struct Scores {
   int count = 0;
   Score<S> of[kMaxScores];
 };
+
+// What the removal of a splat adds to one pixel's squared error; `slope` [3] d image_c / d alpha, `residual` [3].
+template <class V>
+SW_HD V removal_change(V alpha, const V* slope, const V* residual) {
+  V sum = constant<V>(0);
+  for (int c = 0; c < 3; ++c) {
+    const V change = -(alpha * slope[c]);
+    sum += change * (change + residual[c] + residual[c]);
+  }
+  return sum;
+}
 
 // The sums behind a Fisher block: Q's 12 distinct moments dx^i dy^j of sum_c v_c^2, by degree and then by falling i;
 // then sum v_c w m for each channel; then sum w^2.

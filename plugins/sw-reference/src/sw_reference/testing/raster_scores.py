@@ -9,7 +9,7 @@ from splatwizard_core.api import GaussianInputs, Rasterizer, RasterOptions, Scor
 from sw_reference.scores import view_fisher
 from sw_reference.testing.facts import check, close, draw
 from sw_reference.testing.naive_rasterizer import Pair, naive_render
-from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, margin_scene
+from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, margin_scene, permute_inputs
 
 CASE = RasterCase(
     "scores", n=14, width=37, height=19, color="colors", opacity=(0.8, 0.98), scale=(0.5, 0.9), spread=0.7
@@ -24,7 +24,9 @@ def _value(kind: str, pair: Pair, opacity: Tensor) -> Tensor:
         "opacity": opacity.expand_as(pair.alpha),
         "opacity_T": opacity * pair.before,
         "blend": pair.alpha * pair.before,
+        "blend_sq": (pair.alpha * pair.before) ** 2,
         "blend_max": pair.alpha * pair.before,
+        "shown": (pair.alpha * pair.before > 1 / 255).to(pair.alpha),
         "gamma": pair.alpha ** (2 * _GAMMA) * pair.before ** (2 - 2 * _GAMMA),
         "dist": pair.offset.norm(dim=-1),
     }
@@ -46,14 +48,14 @@ def _compare(r: Rasterizer, device: str, kind: str, rule: str, weight: Tensor | 
         scores = draw(r, device, single, cam.to(dtype=torch.float32), RasterOptions(scores=(spec,))).scores
     assert set(scores) == {"s"}
     close(scores["s"], expected, rtol=1e-4, atol=1e-4)
-    if kind == "hits" and weight is None:
+    if kind in ("hits", "shown") and weight is None:
         assert scores["s"].dtype == torch.int32
 
 
 def _add_score_checks() -> None:
     for kind, feature in (
         ("hits", "HITS"), ("opacity", "OPACITY"), ("opacity_T", "OPACITY_T"), ("blend", "BLEND"),
-        ("blend_max", "BLEND_MAX"), ("gamma", "GAMMA"), ("dist", "DIST"),
+        ("blend_sq", "BLEND_SQ"), ("blend_max", "BLEND_MAX"), ("shown", "SHOWN"), ("gamma", "GAMMA"), ("dist", "DIST"),
     ):  # fmt: skip
         for rule in ("blended", "tested"):
 
@@ -134,6 +136,32 @@ def _grad_sq(g: GaussianInputs, pairs: list[Pair], background: Tensor, policy: s
         assert leaf.grad is not None
         scores[pair.index] = leaf.grad.square().sum()
     return scores
+
+
+@check("SCORE_REMOVAL")
+def removal_is_what_the_squared_error_changes_by(r: Rasterizer, device: str) -> None:
+    """Against renders with each Gaussian in turn left out, some of whose alphas are at their clamp."""
+    case = RasterCase("removal", n=6, width=19, height=9, color="colors", opacity=(0.6, 1.2), scale=(0.3, 0.8))
+    g, cam = margin_scene(case, 2)
+    generator = torch.Generator().manual_seed(4)
+    background = torch.rand(3, cam.height, cam.width, generator=generator, dtype=torch.float64)
+    picture = torch.rand(3, cam.height, cam.width, generator=generator, dtype=torch.float64)
+    options = RasterOptions(background=background)
+
+    def render(inputs: GaussianInputs) -> Tensor:
+        return naive_render(inputs, cam, options).image
+
+    residual = render(g) - picture
+    others = [render(permute_inputs(g, torch.arange(len(g)) != row)) for row in range(len(g))]
+    change = torch.stack([(other - picture - residual).square().sum() for other in others])
+    cost = torch.stack([(other - picture).square().sum() for other in others]) - residual.square().sum()
+    assert bool((cost < 0).any() and (cost > 0).any()), "the case shows one sign only"
+    specs = (ScoreSpec("d", "removal"), ScoreSpec("e", "removal", residual=residual.float().to(device)))
+    options = RasterOptions(scores=specs, background=background.float().to(device))
+    with torch.no_grad():
+        scores = draw(r, device, cast_inputs(g, torch.float32), cam.to(dtype=torch.float32), options).scores
+    close(scores["d"], change, rtol=2e-4, atol=2e-4)
+    close(scores["e"], cost, rtol=2e-4, atol=2e-4)
 
 
 @check("FISHER")

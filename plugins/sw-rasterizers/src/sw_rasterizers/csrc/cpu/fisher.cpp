@@ -1,5 +1,5 @@
-// How the image reacts to a splat: squared derivatives, one row of sums per (splat, tile) pair, and the Fisher blocks
-// that are put together from them.
+// How the image reacts to a splat: squared derivatives and changes by its removal, one row of sums per (splat, tile)
+// pair, and the Fisher blocks that are put together from such sums.
 //
 // Tiles are walked back to front, as in blend_backward, because the light behind a splat must be known; `blend` has
 // left the last transmittance, the last splat and the touched blocks. Rows are added up in float64.
@@ -23,7 +23,6 @@ struct TileSensitivity {
   using I = IntOf<V>;
   static constexpr int L = lanes_of<V>;
   static constexpr int kPacks = kBlockPixels / L;
-  static constexpr int kLights = kForFisher ? 3 : 1;  // channels apart, or their sum
   static constexpr int kAhead = 8;                          // pairs between prefetch and use of a record and a row
   static constexpr int kLine = 64 / int(sizeof(S));         // values of a cache line
 
@@ -38,9 +37,9 @@ struct TileSensitivity {
   struct Workspace {
     PixelCentres<S> centres;
     alignas(64) S transmittance[kTilePixels];
-    alignas(64) S behind[kLights][kTilePixels];
+    alignas(64) S behind[3][kTilePixels];
     alignas(64) int32_t last[kTilePixels];
-    alignas(64) S weight[kForFisher ? 1 : kMaxScores][kTilePixels];
+    alignas(64) S weight[kForFisher ? 1 : kMaxScores][3][kTilePixels];  // of the pixel; of kRemoval the residual
     V clamp_limit;  // of the unclamped alpha, above which its gradient is 0
   };
 
@@ -74,11 +73,12 @@ struct TileSensitivity {
     frame.for_each_pixel([&](int i, int x, int y) {
       const int64_t pixel = int64_t(frame.y0 + y) * view.width + frame.x0 + x;
       for (int c = 0; canvas.background != nullptr && c < 3; ++c)
-        w.behind[c % kLights][i] += w.transmittance[i] *
-                                    canvas.background[canvas.background_is_image ? c * size + pixel : int64_t(c)];
+        w.behind[c][i] =
+            w.transmittance[i] * canvas.background[canvas.background_is_image ? c * size + pixel : int64_t(c)];
       if constexpr (!kForFisher)
         for (int s = 0; s < scores->count; ++s)
-          if (scores->of[s].weight != nullptr) w.weight[s][i] = scores->of[s].weight[pixel];
+          for (int c = 0; scores->of[s].weight != nullptr && c < (scores->of[s].kind == kRemoval ? 3 : 1); ++c)
+            w.weight[s][c][i] = scores->of[s].weight[c * size + pixel];
     });
   }
 
@@ -107,24 +107,29 @@ struct TileSensitivity {
     const V gain = reciprocal(one - alpha);
     const V transmittance = load<V>(w.transmittance + at) * gain, weight = alpha * transmittance;
     store(w.transmittance + at, transmittance);
-    V slope[kLights];  // d image_c / d alpha
-    for (int c = 0; c < kLights; ++c) {
-      const V color = V{} + (kForFisher ? record[kRed + c] : record[kRed] + record[kGreen] + record[kBlue]);
+    V slope[3];  // d image_c / d alpha
+    for (int c = 0; c < 3; ++c) {
+      const V color = V{} + record[kRed + c];
       const V behind = load<V>(w.behind[c] + at);
-      slope[c] = select(through, transmittance * color - behind * gain, zero);
+      slope[c] = transmittance * color - behind * gain;
       store(w.behind[c] + at, behind + weight * color);
     }
     if constexpr (kForFisher) {
       V v[3];
-      for (int c = 0; c < 3; ++c) v[c] = -(unclamped * slope[c]);
+      for (int c = 0; c < 3; ++c) v[c] = -(unclamped * select(through, slope[c], zero));
       add_fisher_pixel(dx, dy, v, weight, total);
     } else {
-      const V square = slope[0] * slope[0];
+      const V sum = select(through, slope[0] + slope[1] + slope[2], zero), square = sum * sum;
       for (int s = 0; s < scores->count; ++s) {
-        if (scores->of[s].weight != nullptr)
-          total[s] += square * load<V>(w.weight[s] + at);
-        else
+        const auto plane = [&](int c) { return load<V>(w.weight[s][c] + at); };
+        if (scores->of[s].kind == kRemoval) {
+          const V residual[3] = {plane(0), plane(1), plane(2)};
+          total[s] += removal_change(alpha, slope, residual);
+        } else if (scores->of[s].weight != nullptr) {
+          total[s] += square * plane(0);
+        } else {
           total[s] += square;
+        }
       }
     }
   }
@@ -141,7 +146,7 @@ void sensitivity_tiles(const View<Scalar<V>>& view, const Settings& settings, co
   std::atomic<int64_t> next{0};
   parallel(settings.threads, [&](int, int) {
     const auto w = std::make_unique<typename Tiles::Workspace>();
-    std::fill_n(&w->weight[0][0], sizeof w->weight / sizeof(Scalar<V>), Scalar<V>(0));
+    std::fill_n(&w->weight[0][0][0], sizeof w->weight / sizeof(Scalar<V>), Scalar<V>(0));
     for (int64_t i; (i = next.fetch_add(1, std::memory_order_relaxed)) < tiles;) walk(order[size_t(i)], *w);
   });
 }

@@ -11,7 +11,7 @@
 
 namespace sw {
 
-// What sensitivity_pairs adds up: the Fisher sums, or (dL/dalpha)^2 once for every score.
+// What sensitivity_pairs adds up: the Fisher sums, or for every score (dL/dalpha)^2 or the change by removal.
 template <class S>
 struct Sensitivity {
   bool fisher;

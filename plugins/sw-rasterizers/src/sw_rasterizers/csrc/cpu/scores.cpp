@@ -127,6 +127,12 @@ struct TileScorer {
         case kBlendMax:
           value = counted * (alpha * before);
           break;
+        case kBlendSq:
+          value = counted * (alpha * before) * (alpha * before);
+          break;
+        case kShown:
+          value = select(alpha * before > constant<V>(kShownMin), counted, zero);
+          break;
         case kGamma: {
           const V two = constant<V>(2), g = V{} + score.gamma;
           const V log_alpha = log_2(select(tried, alpha, one)), log_t = log_2(select(tried, before, one));

@@ -1,5 +1,5 @@
-// How the image reacts to a splat, back to front as in `blend_backward`: squared derivatives, and the Fisher blocks of
-// the Gaussians from 28 sums a splat.
+// How the image reacts to a splat, back to front as in `blend_backward`: squared derivatives, changes by its removal, and
+// the Fisher blocks of the Gaussians from 28 sums a splat.
 //
 // A block of 4 warps takes a tile, a warp an 8 x 8 quarter of it, two pixels a lane.
 #include "../blend.h"
@@ -16,13 +16,24 @@ namespace {
 constexpr int kWarps = 4, kThreads = kWarps * kWarp, kWords = kThreads / kWarp;
 constexpr int kPixels = 2;  // a lane: its pixel in each of the warp's two boxes
 
-template <int kLights>
 struct PixelState {
   float transmittance;
-  float behind[kLights];
+  float behind[3];
   int last;
   int64_t at;
 };
+
+// What one pixel adds to a score; `square` of dL/dalpha, `slope` [3], `at` the pixel of an image of `size`.
+__device__ __forceinline__ float pixel_value(const Score<float>& score, float square, float alpha, const float* slope,
+                                             int64_t at, int64_t size) {
+  if (score.kind != kRemoval) return score.weight == nullptr ? square : square * score.weight[at];
+  float residual[3] = {};
+  if (score.weight != nullptr && alpha > 0.f) {
+#pragma unroll
+    for (int c = 0; c < 3; ++c) residual[c] = score.weight[c * size + at];
+  }
+  return removal_change(alpha, slope, residual);
+}
 
 // kForFisher: rows of sums a splat; else totals of the Gaussians. `pair_sums`, if given, takes each warp's part instead,
 // of all sums of a row or of the one score.
@@ -31,7 +42,6 @@ __global__ void __launch_bounds__(kThreads)
     sensitivity_kernel(View<float> view, Splats splats, TileLists lists, Image image, float clamp_limit, float* rows,
                        const __grid_constant__ Scores<float> scores, const __grid_constant__ Totals totals,
                        float* pair_sums) {
-  constexpr int kLights = kForFisher ? 3 : 1;  // channels apart, or their sum
   __shared__ float4 shape[2][kThreads];
   __shared__ float blue[kThreads];
   __shared__ int target[kThreads];  // row of the splat, or Gaussian
@@ -48,7 +58,7 @@ __global__ void __launch_bounds__(kThreads)
   const int64_t size = int64_t(view.width) * view.height;
   const float centre_x = float(x) + 0.5f, centre_y = float(y) + 0.5f;
 
-  PixelState<kLights> pixel[kPixels];
+  PixelState pixel[kPixels];
 #pragma unroll
   for (int p = 0; p < kPixels; ++p) {
     pixel[p] = {1.f, {}, 0, 0};
@@ -60,7 +70,7 @@ __global__ void __launch_bounds__(kThreads)
     if (image.background == nullptr) continue;
 #pragma unroll
     for (int c = 0; c < 3; ++c)
-      pixel[p].behind[c % kLights] +=
+      pixel[p].behind[c] =
           pixel[p].transmittance * image.background[image.background_is_image ? c * size + at : int64_t(c)];
   }
   const int warp_last = int(warp_max(unsigned(max(pixel[0].last, pixel[1].last))));
@@ -98,12 +108,13 @@ __global__ void __launch_bounds__(kThreads)
         const float4 s0 = shape[0][k], s1 = shape[1][k];
         const float dx = s0.x - centre_x;
         const float colors[3] = {s1.z, s1.w, blue[k]};
-        float sums[kForFisher ? kFisherSums : kPixels] = {};
+        float sums[kForFisher ? kFisherSums : 1] = {};
+        float square[kPixels] = {}, alphas[kPixels] = {}, slopes[kPixels][3] = {};  // of scores
         bool any_touched = false;
 #pragma unroll
         for (int p = 0; p < kPixels; ++p) {
           if (!(reached[p] >> bit & 1)) continue;
-          PixelState<kLights>& state = pixel[p];
+          PixelState& state = pixel[p];
           const float dy = s0.y - (centre_y + float(p * kBoxHeight));
           const float power = log2_alpha(dx, dy, s0.z, s0.w, s1.x, s1.y);
           const bool touched = power >= float(kLog2AlphaMin) && state.last > at;
@@ -113,19 +124,22 @@ __global__ void __launch_bounds__(kThreads)
           const float gain = reciprocal(1.f - alpha);
           state.transmittance *= gain;
           const float weight = alpha * state.transmittance;
-          float slope[kLights];  // d image_c / d alpha
+          const bool through = touched && unclamped <= clamp_limit;
+          float slope[3];  // d image_c / d alpha
 #pragma unroll
-          for (int c = 0; c < kLights; ++c) {
-            const float color = kForFisher ? colors[c] : colors[0] + colors[1] + colors[2];
-            const float found = state.transmittance * color - state.behind[c] * gain;
-            slope[c] = touched && unclamped <= clamp_limit ? found : 0.f;
-            state.behind[c] += weight * color;
+          for (int c = 0; c < 3; ++c) {
+            slope[c] = state.transmittance * colors[c] - state.behind[c] * gain;
+            state.behind[c] += weight * colors[c];
           }
           if constexpr (kForFisher) {
-            const float v[3] = {-unclamped * slope[0], -unclamped * slope[1], -unclamped * slope[2]};
+            const float factor = through ? -unclamped : 0.f;
+            const float v[3] = {factor * slope[0], factor * slope[1], factor * slope[2]};
             add_fisher_pixel(dx, dy, v, weight, sums);
           } else {
-            sums[p] = slope[0] * slope[0];
+            const float sum = through ? slope[0] + slope[1] + slope[2] : 0.f;
+            square[p] = sum * sum, alphas[p] = alpha;
+#pragma unroll
+            for (int c = 0; c < 3; ++c) slopes[p][c] = slope[c];
           }
         }
         if (!any_touched) continue;
@@ -139,14 +153,17 @@ __global__ void __launch_bounds__(kThreads)
         } else {
           const double opacity = exp_2(s1.y);
           for (int s = 0; s < scores.count; ++s) {
-            const float* map = scores.of[s].weight;
-            float total = map == nullptr ? sums[0] + sums[1] : sums[0] * map[pixel[0].at] + sums[1] * map[pixel[1].at];
+            float total = 0.f;
+#pragma unroll
+            for (int p = 0; p < kPixels; ++p)
+              total += pixel_value(scores.of[s], square[p], alphas[p], slopes[p], pixel[p].at, size);
             total = spread_sums<1>(&total);
             if (lane_index() != 0 || total == 0.f) continue;
+            const double found = scores.of[s].kind == kRemoval ? double(total) : opacity * opacity * total;
             if (pair_sums != nullptr)
-              pair_sums[(int64_t(begin) + at) * kWarps + warp_index()] = float(opacity * opacity * total);
+              pair_sums[(int64_t(begin) + at) * kWarps + warp_index()] = float(found);
             else
-              atomicAdd(totals.of[s] + target[k], opacity * opacity * total);
+              atomicAdd(totals.of[s] + target[k], found);
           }
         }
       }
@@ -211,7 +228,7 @@ float clamp_limit(bool pass_clamp) { return pass_clamp ? 3e38f : float(kAlphaMax
 
 }  // namespace
 
-void square_derivatives(const View<float>& view, bool pass_clamp, const Splats& splats, const TileLists& lists,
+void sensitivity_scores(const View<float>& view, bool pass_clamp, const Splats& splats, const TileLists& lists,
                         const Image& image, const Scores<float>& scores, const Totals& totals, const Ordered& ordered,
                         cudaStream_t stream) {
   if (ordered.pair_sums == nullptr) {

@@ -1,7 +1,7 @@
 // The CUDA kernels of scores and Fisher blocks; they take the lists and the pixels that `render` leaves.
 //
 //   score_pixels         lists -> totals of the Gaussians, front to back
-//   square_derivatives   the same of (o dL/dalpha)^2, back to front
+//   sensitivity_scores   the same of (o dL/dalpha)^2 and of changes by removal, back to front
 //   fisher_sums          lists -> a row of sums for every splat, back to front
 //   fisher_blocks        rows -> Fisher blocks of the Gaussians
 #pragma once
@@ -20,7 +20,7 @@ constexpr int kScoreParts = 8, kFisherParts = 4;
 
 void score_pixels(const View<float>& view, const Splats& splats, const TileLists& lists, const Scores<float>& scores,
                   const Totals& totals, const Ordered& ordered, cudaStream_t stream);
-void square_derivatives(const View<float>& view, bool pass_clamp, const Splats& splats, const TileLists& lists,
+void sensitivity_scores(const View<float>& view, bool pass_clamp, const Splats& splats, const TileLists& lists,
                         const Image& image, const Scores<float>& scores, const Totals& totals, const Ordered& ordered,
                         cudaStream_t stream);
 // rows [splats][kFisherSums], zeros before.

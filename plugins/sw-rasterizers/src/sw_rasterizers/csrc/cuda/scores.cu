@@ -31,6 +31,10 @@ __device__ __forceinline__ float pixel_value(const Score<float>& score, float co
     case kBlend:
     case kBlendMax:
       return counted * alpha * before;
+    case kBlendSq:
+      return counted * (alpha * before) * (alpha * before);
+    case kShown:
+      return alpha * before > float(kShownMin) ? counted : 0.f;
     case kGamma:
       if (counted == 0.f) return 0.f;
       return exp2f(2.f * (score.gamma * log2f(alpha) + (1.f - score.gamma) * log2f(before)));
