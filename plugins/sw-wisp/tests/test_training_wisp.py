@@ -22,7 +22,6 @@ from sw_wisp.conversion import kept_rows
 from sw_wisp.method import Wisp
 from sw_wisp.removal import unworthy
 from sw_wisp.rounding import FINAL, HARD, NOISE, SOFT, disturbed, soft_round
-from sw_wisp.sensitivity import Removal
 
 PLAN = """\
 Stage | Task                             | Plan
@@ -110,15 +109,14 @@ def test_there_is_no_start_from_points(plugins, toy):
 
 def test_conversion_keeps_the_worthiest_up_to_the_cap():
     costs = torch.tensor([5.0, -1.0, 3.0, 0.0, 2.0, -7.0, 4.0, 1.0, 6.0, 9.0], dtype=torch.float64)
-    removal = Removal(costs, 1.0, 0.1, 10)
     config = apply_overrides(WispConfig(), {"budget.cap": 4, "budget.cap_factor": 0.5}, source="test")
-    assert kept_rows(removal, config).tolist() == [0, 8, 9]  # 1.5 x 0.5 x 4
+    assert kept_rows(costs, config).tolist() == [0, 8, 9]  # 1.5 x 0.5 x 4
     # Three do harm, two of ten may go.
     assert (
-        kept_rows(removal, WispConfig()).tolist() == [0, 1, 2, 3, 4, 6, 7, 8]
-        or 5 not in kept_rows(removal, WispConfig()).tolist()
+        kept_rows(costs, WispConfig()).tolist() == [0, 1, 2, 3, 4, 6, 7, 8]
+        or 5 not in kept_rows(costs, WispConfig()).tolist()
     )
-    assert len(kept_rows(removal, WispConfig())) == 8
+    assert len(kept_rows(costs, WispConfig())) == 8
 
 
 def test_conversion_keeps_the_pictures(train, toy, rasterizer):
@@ -222,3 +220,13 @@ def test_a_file_takes_the_place_of_the_scene_that_the_preset_would_train(plugins
     asked = resolve(Wisp, "paper", sets={"init": str(ply), "pretrained.iterations": 9}, plugins=plugins)
     with pytest.raises(ConfigError, match="give one of them"):
         checked_start(plugins, asked)
+
+
+def test_latents_may_have_steps_of_their_own(train):
+    _, alike = train(iterations=1, scale_schedule=False)
+    _, own = train(iterations=1, scale_schedule=False, appearance__steps="sensitivity", appearance__spread=1.5)
+    ratio = own.rate.base_steps / alike.rate.base_steps
+    assert torch.equal(ratio[:10], torch.ones(10, dtype=torch.float64))
+    assert len(ratio[10:].unique()) > 3
+    assert ratio.min() >= 1 / 1.5 - 1e-9
+    assert ratio.max() <= 1.5 + 1e-9

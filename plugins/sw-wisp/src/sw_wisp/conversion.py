@@ -15,8 +15,8 @@ from sw_wisp.model import WispModel
 from sw_wisp.numbers import LATENTS, LOWEST_LEVEL
 from sw_wisp.positions import MARGIN
 from sw_wisp.rate_model import StaticRate
-from sw_wisp.sensitivity import Removal, removal_cost, squared_slopes
 from sw_wisp.shape import log_covariance
+from sw_wisp.worth import slopes, worth
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Rasterizer, View
@@ -26,9 +26,12 @@ HEAD_ROOM = 1.5
 """Splats that may begin, in caps: removal takes the rest while it trains."""
 
 
-def kept_rows(removal: Removal, config: WispConfig) -> Tensor:
-    """Return the rows [M] int64, ascending, that begin: the cap's of greatest worth, and few that do harm."""
-    costs, n = removal.squared_error, len(removal.squared_error)
+def kept_rows(costs: Tensor, config: WispConfig) -> Tensor:
+    """Return the rows [M] int64, ascending, that begin: as many as the cap lets of the worthiest, few that do harm.
+
+    costs   [N] of removal: at most 0 where the pictures are as good without
+    """
+    n = len(costs)
     cap = round(HEAD_ROOM * config.budget.cap * config.budget.cap_factor)
     harmful = min(int((costs <= 0).sum()), int(config.budget.worthless * n))
     keep = max(1, min(n - harmful, cap))
@@ -48,16 +51,15 @@ def converted(
     generator   of random signs and of the network's first weights, on the CPU
     """
     model.active_sh_degree = model.max_sh_degree
-    removal = removal_cost(model, views, rasterizer, background, lambda_dssim=config.loss.lambda_dssim)
-    rows = kept_rows(removal, config)
+    found = worth(model, views, rasterizer, background, lambda_dssim=config.loss.lambda_dssim)
+    rows = kept_rows(found.squared_error, config)
     network = AppearanceNetwork(
         LATENTS.width, config.appearance.hidden, max(model.max_sh_degree, 1), generator=generator
     ).to(background.device)
     with torch.no_grad():
         if model.max_sh_degree:
-            names, draws = ["sh_rest"], 2
-            slopes = squared_slopes(model, names, views, rasterizer, background, generator, draws=draws)["sh_rest"]
-            latents = network.fit(model.sh_rest[rows], slopes.flatten(1).mean(1)[rows])
+            weights = slopes(model, ["sh_rest"], views, rasterizer, background, generator)["sh_rest"].flatten(1).mean(1)
+            latents = network.fit(model.sh_rest[rows], weights[rows])
         else:
             latents = model.means.new_zeros(len(rows), LATENTS.width)
         shape, size = log_covariance(model.log_scales.double(), model.quats.double())

@@ -34,10 +34,11 @@ from sw_wisp.config import WispConfig
 from sw_wisp.conversion import converted
 from sw_wisp.cube import Cube
 from sw_wisp.model import WispModel
+from sw_wisp.numbers import LATENTS
 from sw_wisp.positions import MARGIN, levels_by_cost, middle_scales
 from sw_wisp.removal import copy_some, unworthy
 from sw_wisp.rounding import FINAL, HARD, NOISE, SOFT
-from sw_wisp.sensitivity import Removal, removal_cost, squared_slopes
+from sw_wisp.worth import Worth, slopes, worth
 
 NETWORK_EPS = 1e-8
 SENSITIVE_VIEWS = 64
@@ -100,6 +101,8 @@ class WispStage(Stage):
         found.split_seed = context.generator("split").initial_seed()
         self.tidy(found)
         self.set_levels(found, views, context.rasterizer, background, "begin")
+        if self.config.appearance.steps == "sensitivity":
+            self.set_latent_steps(found, views, context.rasterizer, background)
         found.rate.measure(found.numbers().detach(), found.levels)
         return found
 
@@ -232,9 +235,9 @@ class WispStage(Stage):
         before, prune = model.num_rows, self.config.prune
         background = scene.background.to(model.device)
         with still(model):
-            cost = self.cost(model, cameras, rasterizer, background)
+            found = self.worth(model, cameras, rasterizer, background)
             bits = model.bits().sum(1) + model.place_bits()
-        doomed = unworthy(cost.loss_rise, bits, self.price(), prune.share)
+        doomed = unworthy(found.loss_rise, bits, self.price(), prune.share)
         if len(doomed) == before:
             raise EmptyModel(step)
         kept = torch.ones(before, dtype=torch.bool, device=model.device)
@@ -256,9 +259,9 @@ class WispStage(Stage):
 
     # Parts
 
-    def cost(self, model: SplatModel, views: list[View], rasterizer: Rasterizer, background: Tensor) -> Removal:
-        """Cost of removing each splat, over all training views."""
-        return removal_cost(model, views, rasterizer, background, lambda_dssim=self.config.loss.lambda_dssim)
+    def worth(self, model: SplatModel, views: list[View], rasterizer: Rasterizer, background: Tensor) -> Worth:
+        """Return what each splat is worth to all training views."""
+        return worth(model, views, rasterizer, background, lambda_dssim=self.config.loss.lambda_dssim)
 
     def tidy(self, model: WispModel) -> None:
         """Bring all numbers into the ranges that are kept."""
@@ -275,11 +278,20 @@ class WispStage(Stage):
         else:
             draws = stream(model.split_seed, f"levels/{stream_name}")
             some = [views[i] for i in torch.randperm(len(views), generator=draws)[:SENSITIVE_VIEWS].tolist()]
-            slopes = squared_slopes(model, ["means"], some, rasterizer, background, draws)["means"].sum(1)
-            cost = self.cost(model, views, rasterizer, background)
-            scale = cost.loss / (2 * cost.total_error) * len(views) / len(some)
-            levels = levels_by_cost(slopes.double() * scale, self.price(), cube.edge, rule.eta)
+            squared = slopes(model, ["means"], some, rasterizer, background, draws)["means"].sum(1)
+            found = self.worth(model, views, rasterizer, background)
+            scale = found.loss_of_error * len(views) / len(some)
+            levels = levels_by_cost(squared.double() * scale, self.price(), cube.edge, rule.eta)
         model.levels = levels.clamp(rule.level_min, rule.level_max)
+
+    def set_latent_steps(self, model: WispModel, views: list[View], rasterizer: Rasterizer, background: Tensor) -> None:
+        """Give each latent the step that makes its error in the pictures as large as that of the others."""
+        draws, spread = stream(model.split_seed, "latents"), self.config.appearance.spread
+        some = [views[i] for i in torch.randperm(len(views), generator=draws)[:SENSITIVE_VIEWS].tolist()]
+        weights = slopes(model, ["latents"], some, rasterizer, background, draws)["latents"].double().sum(0)
+        logs = weights.clamp_min(1e-30).log()
+        factors = ((logs.mean() - logs) / 2).exp().clamp(1 / spread, spread)
+        model.rate.base_steps[LATENTS.columns] *= factors
 
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
         """The photometric loss, lambda times the bits of the file over the pixels of a picture, the mean opacity."""
