@@ -34,7 +34,7 @@ from sw_wisp.config import WispConfig
 from sw_wisp.conversion import converted
 from sw_wisp.cube import Cube
 from sw_wisp.model import WispModel
-from sw_wisp.numbers import LATENTS
+from sw_wisp.numbers import GROUPS, LATENTS
 from sw_wisp.positions import MARGIN, levels_by_cost, middle_scales
 from sw_wisp.removal import copy_some, unworthy
 from sw_wisp.rounding import FINAL, HARD, NOISE, SOFT
@@ -209,7 +209,7 @@ class WispStage(Stage):
         optimizer.keep_rows(model, model.file_order())
         self.measure(model)
 
-    def freeze(self, model: WispModel, optimizer: SplatOptimizer) -> None:
+    def freeze(self, model: WispModel, optimizer: SplatOptimizer, log: TaskLog) -> None:
         """Round all numbers for good; splats take the order of the file, in which those of equal depth are drawn."""
         self.measure(model)
         forecast = model.forecast()
@@ -218,6 +218,11 @@ class WispStage(Stage):
         model.set_numbers(values)
         optimizer.keep_rows(model, model.file_order())
         model.phase = FINAL
+        with still(model):
+            bits = model.bits().mean(0)
+        parts = {"place": model.place_bits().mean()} | {group.name: bits[group.columns].sum() for group in GROUPS}
+        told = ", ".join(f"{name} {part.item():.1f}" for name, part in parts.items())
+        log.say(f"{model.num_rows:,} splats; bits of each: {told}")
 
     def prune(
         self,
