@@ -9,6 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from splatwizard_core.api import BitstreamError
 from sw_codecs.bits.packing import ByteReader, write_varint
@@ -67,6 +69,17 @@ def row_exponents(weight: np.ndarray, lowest: int) -> np.ndarray:
     error = ((np.ldexp(q, choices) - weight) ** 2).sum(2)
     best: np.ndarray = lowest + error.argmin(0)
     return best
+
+
+def rounded_weights(weight: Tensor, lowest: int = LOWEST_EXPONENT) -> Tensor:
+    """Weights [out,in] as `EightBitLayer.nearest` would have them, in float, with a straight-through gradient."""
+    with torch.no_grad():
+        exact = weight.double()
+        units = 2.0 ** torch.arange(lowest, HIGHEST_EXPONENT + 1, device=weight.device).double()[:, None, None]
+        tried = (exact / units).round().clamp(-LARGEST_WEIGHT, LARGEST_WEIGHT) * units  # [E,out,in]
+        best = (tried - exact).square().sum(2).argmin(0)  # [out]
+        rounded = tried.gather(0, best[None, :, None].expand(1, -1, weight.shape[1]))[0].to(weight)
+    return weight + (rounded - weight.detach())
 
 
 def pack_layers(layers: Sequence[EightBitLayer]) -> bytes:

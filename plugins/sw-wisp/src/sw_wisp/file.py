@@ -39,12 +39,13 @@ from sw_wisp.packets import (
     check_order,
     default_order,
 )
+from sw_wisp.predicting import PyramidContext
 from sw_wisp.static import StaticContext
 
 if TYPE_CHECKING:
     from splatwizard_core.api import ContainerReader, ContainerWriter
 
-CONTEXTS: dict[str, Any] = {StaticContext.kind: StaticContext}
+CONTEXTS: dict[str, Any] = {each.kind: each for each in (StaticContext, PyramidContext)}
 BYTES_OF_A_ROW = 4 * NUMBERS * 4 + 5 * 8 + 59 * 4
 """Of memory that a decoded splat takes: its integers, its cell, and the Gaussian."""
 MOST_ROWS = 1 << 26

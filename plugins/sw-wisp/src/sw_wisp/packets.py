@@ -94,6 +94,9 @@ class Context(Protocol):
     kind: str
     waves: tuple[int, int]
 
+    def start(self) -> None:
+        """A walk begins: forget the splats of the one before."""
+
     def predict(self, block: slice, rows: np.ndarray, state: State) -> Prediction:
         """Distributions of the columns `block` of splats `rows`, all blocks before it known."""
 
@@ -128,6 +131,7 @@ class Walk:
     ) -> None:
         self.state = State()
         self._context, self._shares, self._planes = context, shares, planes
+        context.start()
         self._subsets, self._choose = subsets, choose
         self._rows: dict[int, np.ndarray] = {}
         self._chosen = np.empty((0, NUMBERS), np.int32)  # whole indices, where `choose` gives them
@@ -148,12 +152,12 @@ class Walk:
         self._rows[packet.subset] = rows
         if self._choose is not None:
             self._chosen = np.concatenate([self._chosen, np.zeros((len(rows), NUMBERS), np.int32)])
-        for wave in waves(rows, self._context.waves[number > 0]):
+        for wave in self._waves(rows):
             for block in BLOCKS[:-1]:
                 self._predict(block, wave)
                 self._code(stream, block, wave, 0 if block == OPACITY.columns else self._planes)
             self._context.changed(wave, slice(0, LATENTS.columns.start), None, state)
-        self._predict(LATENTS.columns, rows)  # once, before any of the latents; until `view` they stand at their means
+        self._predict(LATENTS.columns, rows)  # until `view` they stand at their means
 
     def _predict(self, block: slice, rows: np.ndarray) -> None:
         found = self._context.predict(block, rows, self.state)
@@ -192,9 +196,16 @@ class Walk:
         self._context.changed(rows, REFINED, before, state)
 
     def _view(self, stream: Stream, rows: np.ndarray) -> None:
-        self._code(stream, LATENTS.columns, rows, 0)
-        self.state.has_view[rows] = True
-        self._context.changed(rows, LATENTS.columns, None, self.state)
+        for wave in self._waves(rows):
+            self._predict(LATENTS.columns, wave)  # again: more is known by now
+            self._code(stream, LATENTS.columns, wave, 0)
+            self.state.has_view[wave] = True
+            self._context.changed(wave, LATENTS.columns, None, self.state)
+
+    def _waves(self, rows: np.ndarray) -> list[np.ndarray]:
+        """Parts of the rows of one subset."""
+        is_first = len(rows) > 0 and rows[0] == 0
+        return waves(rows, self._context.waves[not is_first])
 
 
 def waves(rows: np.ndarray, count: int) -> list[np.ndarray]:

@@ -65,6 +65,9 @@ class StaticContext:
                 tables[number, column] = bits.argmin()
         return cls(row, means, tables, steps)
 
+    def start(self) -> None:
+        """Forget nothing."""
+
     def predict(self, block: slice, rows: np.ndarray, state: State) -> Prediction:
         """Distributions of the columns `block` of splats `rows`."""
         at = self.row[state.levels[rows] - LOWEST_LEVEL]
