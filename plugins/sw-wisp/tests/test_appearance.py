@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from sw_wisp.appearance import AppearanceNetwork, colour_of, eight_bits, sh_dc_of
+from sw_wisp.appearance import AppearanceNetwork, colour_of, sh_dc_of
+from sw_wisp.eight_bits import rounded_weights
 
 
 def test_colour_comes_back_and_is_orthonormal() -> None:
@@ -53,7 +54,7 @@ def test_rounded_network_is_the_one_of_the_file() -> None:
     again = AppearanceNetwork.of_layers(network.layers(), 3)
     assert torch.allclose(network(latents, colour), again(latents, colour), atol=2e-3)  # biases of 16 bits
     for name in ("basis", "hidden.weight", "out.weight"):
-        assert torch.equal(eight_bits(network.get_parameter(name)), again.get_parameter(name))
+        assert torch.equal(rounded_weights(network.get_parameter(name)), again.get_parameter(name))
 
 
 def test_layers_that_do_not_fit_are_refused() -> None:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from splatwizard_core.api import SH_C0
-from sw_wisp.eight_bits import HIGHEST_EXPONENT, LARGEST_WEIGHT, LOWEST_EXPONENT, EightBitLayer
+from sw_wisp.eight_bits import EightBitLayer, rounded_weights
 
 COLOURS = 3
 
@@ -67,7 +67,7 @@ class AppearanceNetwork(nn.Module):
         """Return SH coefficients [N,K/3,3] of bands 1 and up for latents [N,A] and colours [N,3]; differentiable."""
         basis, first, last = self.basis, self.hidden.weight, self.out.weight
         if self.rounds:
-            basis, first, last = eight_bits(basis), eight_bits(first), eight_bits(last)
+            basis, first, last = (rounded_weights(weight) for weight in (basis, first, last))
         inner = torch.relu(F.linear(torch.cat([latents, colour], dim=1), first, self.hidden.bias))
         rest: Tensor = F.linear(inner, last, self.out.bias) + latents @ basis.T
         return rest.view(len(latents), -1, 3)
@@ -111,18 +111,3 @@ class AppearanceNetwork(nn.Module):
         self.basis.copy_(basis.to(self.basis))
         self.out.bias.copy_(mean.to(self.out.bias))
         return (centred @ basis).to(sh_rest)
-
-
-def eight_bits(weight: Tensor) -> Tensor:
-    """Return weights [out,in] as q 2^e, |q| <= 127, with the exponent of least error for each row; straight-through.
-
-    The same as `EightBitLayer.nearest` of them.
-    """
-    with torch.no_grad():
-        exact = weight.double()
-        exponents = torch.arange(LOWEST_EXPONENT, HIGHEST_EXPONENT + 1, device=weight.device)
-        units = (2.0 ** exponents.double())[:, None, None]
-        tried = (exact / units).round().clamp(-LARGEST_WEIGHT, LARGEST_WEIGHT) * units  # [E,out,in]
-        best = (tried - exact).square().sum(2).argmin(0)  # [out]
-        rounded = tried.gather(0, best[None, :, None].expand(1, -1, weight.shape[1]))[0].to(weight)
-    return weight + (rounded - weight.detach())

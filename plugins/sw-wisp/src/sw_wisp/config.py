@@ -40,13 +40,18 @@ class Steps(Params):
     chroma: float = Field(0.07, gt=0, le=4, description="of its two chromas")
     latents: float = Field(0.15, gt=0, le=4, description="of the latents, SH units")
     factor: float = Field(1.0, gt=0, le=8, description="multiplies all of them")
+    adaptive: bool = Field(True, description="let the networks of the context multiply them by up to 2 or 1/64")
 
 
 class Context(Params):
     """What predicts the numbers of a splat."""
 
-    kind: Literal["none"] = Field("none", description="none: a mean and a deviation for each number and level")
-    rebuild: int = Field(100, ge=1, description="steps between measurements of what predicts")
+    kind: Literal["none", "pyramid"] = Field(
+        "pyramid",
+        description="none: a mean and a deviation for each number and level; pyramid: networks on running means of the "
+        "splats before",
+    )
+    rebuild: int = Field(200, ge=1, description="steps between measurements; half as many while numbers are rounded")
 
 
 class Positions(Params):

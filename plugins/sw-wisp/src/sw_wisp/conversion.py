@@ -14,7 +14,7 @@ from sw_wisp.cube import Cube
 from sw_wisp.model import WispModel
 from sw_wisp.numbers import LATENTS, LOWEST_LEVEL
 from sw_wisp.positions import MARGIN
-from sw_wisp.rate_model import StaticRate
+from sw_wisp.rate_model import PyramidRate, StaticRate
 from sw_wisp.shape import log_covariance
 from sw_wisp.worth import slopes, worth
 
@@ -64,9 +64,12 @@ def converted(
             latents = model.means.new_zeros(len(rows), LATENTS.width)
         shape, size = log_covariance(model.log_scales.double(), model.quats.double())
         means = model.means[rows].detach()
-        rate = StaticRate(torch.tensor(config.base_steps)).to(background.device)
+        steps = torch.tensor(config.base_steps)
+        rate: StaticRate | PyramidRate = StaticRate(steps)
+        if config.context.kind == "pyramid":
+            rate = PyramidRate(steps, adaptive=config.steps.adaptive, generator=generator)
         return WispModel(
             means, model.opacity_logits[rows], shape[rows], size[rows], colour_of(model.sh_dc)[rows], latents,
             torch.full((len(rows),), LOWEST_LEVEL, device=background.device), cube=Cube.around(means, margin=MARGIN),
-            network=network, rate=rate, sharpest=config.phases.sharpness,
+            network=network, rate=rate.to(background.device), sharpest=config.phases.sharpness,
         )  # fmt: skip

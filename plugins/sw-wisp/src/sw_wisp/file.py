@@ -66,6 +66,7 @@ class Scene:
     order       (subset, kind) of each packet; None: `default_order`
     planes      refinements of shape, size and colour, 0 to 2
     context     None: statistics of the values by level and column
+    in_order    whether splats of one cell keep their order; else the most opaque come first
     strengths   [planes + 1, 5] in 0..1 of the pull towards centroids, by missing refinements and group; None: 0
     """
 
@@ -81,6 +82,7 @@ class Scene:
     planes: int = 0
     context: Context | None = None
     strengths: np.ndarray | None = None
+    in_order: bool = False
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,8 @@ def encode(scene: Scene, writer: ContainerWriter, choose: Choose | None = None) 
     labels = np.zeros(len(levels), np.int64) if scene.subsets is None else np.asarray(_array(scene.subsets), np.int64)
     count = int(labels.max(initial=0)) + 1
     order = scene.order or default_order(count, scene.planes)
-    rows, subsets = _sorted(levels, places, values, labels, [s for s, kind in order if kind == "base"])
+    ranks = -np.arange(len(levels)) if scene.in_order else values[:, 0]
+    rows, subsets = _sorted(levels, places, ranks, labels, [s for s, kind in order if kind == "base"])
     steps = np.asarray(scene.base_steps, np.float64)
     limits = np.array(numbers.LIMITS)
     units = np.clip(values[rows], -limits, limits) * (UNIT / steps)
@@ -255,12 +258,12 @@ def _floats(static: dict[str, Any], key: str, count: int, limit: float) -> list[
 
 
 def _sorted(
-    levels: np.ndarray, places: np.ndarray, values: np.ndarray, labels: np.ndarray, subsets: list[int]
+    levels: np.ndarray, places: np.ndarray, ranks: np.ndarray, labels: np.ndarray, subsets: list[int]
 ) -> tuple[np.ndarray, list[Cells]]:
     """Rows of the scene in the order of the file, and the cells of each subset in the order of their bases."""
     cells = Cells(levels, morton.encode(places))
     _, crowd = np.unique(np.stack([levels, cells.codes]), axis=1, return_counts=True)
-    order = file_order(levels, places, values[:, 0])
+    order = file_order(levels, places, ranks)
     parts = [order[labels[order] == subset] for subset in subsets]
     rows = np.concatenate([np.empty(0, np.int64), *parts])
     if crowd.max(initial=0) > MOST_IN_A_CELL or len(rows) != len(levels):

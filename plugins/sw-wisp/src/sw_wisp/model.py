@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -11,12 +12,14 @@ from torch import Tensor, nn
 from splatwizard_core.api import SH, GaussianInputs, GaussianModel, SplatModel
 from sw_codecs.positions import morton
 from sw_wisp.appearance import AppearanceNetwork, sh_dc_of
+from sw_wisp.context import Forecast
 from sw_wisp.cube import Cube
 from sw_wisp.file import Scene
 from sw_wisp.numbers import COLOUR, GROUPS, LATENTS, OPACITY, SHAPE, SIZE
-from sw_wisp.octree import Cells, file_order, position_bits
-from sw_wisp.rate_model import Forecast, StaticRate
-from sw_wisp.rounding import FLOAT, HARD, disturbed
+from sw_wisp.octree import Cells, position_bits
+from sw_wisp.pyramid import FEATURES
+from sw_wisp.rate_model import Placed, PyramidRate, StaticRate, bits_of
+from sw_wisp.rounding import FINAL, FLOAT, HARD, disturbed
 from sw_wisp.shape import bounded, covariance, scales_and_quats
 
 if TYPE_CHECKING:
@@ -57,6 +60,8 @@ class WispModel(SplatModel):
     colour      [N,3] luma and chroma
     latents     [N,12] view dependence
     levels      [N] int64, level of the octree
+    features, view_features
+                [N,69] what networks of the rate model see of the splats before; only where it has networks
     network     latents and colour to SH bands 1 and up
     rate        distributions of the 22 numbers
     cube        the root cube of the octree
@@ -74,7 +79,8 @@ class WispModel(SplatModel):
 
     def __init__(
         self, means: Tensor, opacity: Tensor, shape: Tensor, size: Tensor, colour: Tensor, latents: Tensor,
-        levels: Tensor, *, cube: Cube, network: AppearanceNetwork, rate: StaticRate, sharpest: float = 8.0,
+        levels: Tensor, *, cube: Cube, network: AppearanceNetwork, rate: StaticRate | PyramidRate,
+        sharpest: float = 8.0,
     ) -> None:  # fmt: skip
         super().__init__()
         rows = {
@@ -83,6 +89,10 @@ class WispModel(SplatModel):
         for name, values in rows.items():
             self.register_parameter(name, nn.Parameter(values.detach().float().contiguous()))
         self.register_buffer("levels", levels)
+        for name in rate.CONTEXT:
+            if name not in self.ROWS:
+                self.register_buffer(name, means.new_zeros(len(means), FEATURES))
+                self.ROWS = (*self.ROWS, name)
         self.network, self.rate = network, rate
         self.cube = cube
         self.phase, self.sharpness, self.sharpest, self.jitters = FLOAT, 1.0, sharpest, False
@@ -118,25 +128,43 @@ class WispModel(SplatModel):
         self.colour.copy_(colour)
         self.latents.copy_(latents)
 
-    def forecast(self, rows: Tensor | None = None) -> Forecast:
-        """Distributions of the numbers of all splats, or of some rows."""
-        return self.rate.forecast(self.levels if rows is None else self.levels.index_select(0, rows))
+    def predicted(self, rows: Tensor | None = None) -> tuple[Forecast, Tensor]:
+        """Distributions of the numbers of all splats, or of some rows, and these [N,22] as this phase rounds them."""
+        context = (getattr(self, name) for name in self.rate.CONTEXT)
+        context = context if rows is None else (each.index_select(0, rows) for each in context)
+        return self.rate.predict(tuple(context), self.numbers(rows), self._rounded)
 
-    def _drawn(self, values: Tensor, forecast: Forecast) -> Tensor:
-        phase = self.phase if self.training or self.phase == HARD else FLOAT
-        return disturbed(values, forecast.mean, forecast.steps, phase, self.sharpness, self.sharpest)
+    @property
+    def _rounds(self) -> bool:
+        return self.phase == HARD or (self.training and self.phase not in (FLOAT, FINAL))
+
+    def _rounded(self, values: Tensor, mean: Tensor, steps: Tensor) -> Tensor:
+        return disturbed(values, mean, steps, self.phase, self.sharpness, self.sharpest) if self._rounds else values
+
+    def drawn(self) -> Tensor:
+        """The 22 numbers [N,22] of all splats as they are drawn; differentiable."""
+        return self.predicted()[1] if self._rounds else self.numbers()
 
     def bits(self, rows: Tensor | None = None) -> Tensor:
         """Bits [N,22] of the numbers of all splats, or of some rows, as this phase rounds them; differentiable."""
-        forecast = self.forecast(rows)
-        return self.rate.rate(self._drawn(self.numbers(rows), forecast), forecast)
+        forecast, drawn = self.predicted(rows)
+        return bits_of(drawn, forecast)
 
-    @torch.no_grad()
-    def file_order(self) -> Tensor:
-        """Rows [N] int64 in the order of the file."""
-        cells = self.cube.cells(self.means, self.levels)
-        rows = file_order(*(each.cpu().numpy() for each in (self.levels, cells, self.opacity)))
-        return torch.from_numpy(rows).to(self.device)
+    def begin_rate(self) -> None:
+        """Start the rate model anew from the splats."""
+        self._take(self.rate.begin(self._placed()))
+
+    def measure(self) -> None:
+        """Bring the rate model up to date with the splats; once the integers are fixed, only what it reads."""
+        again = self.rate.reread if self.phase == FINAL else self.rate.measure
+        self._take(again(self._placed(), tuple(getattr(self, name) for name in self.rate.CONTEXT)))
+
+    def _placed(self) -> Placed:
+        return Placed(self.numbers().detach(), self.levels, self.cube.cells(self.means, self.levels))
+
+    def _take(self, rows: Mapping[str, Tensor]) -> None:
+        for name, values in rows.items():
+            setattr(self, name, values)
 
     @torch.no_grad()
     def place_bits(self) -> Tensor:
@@ -147,9 +175,7 @@ class WispModel(SplatModel):
 
     def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
         """All splats, whatever the camera."""
-        values = self.numbers()
-        if self.phase != FLOAT:
-            values = self._drawn(values, self.forecast())
+        values = self.drawn()
         means, edges = self.means, self.log_edges(self.levels)
         if self.jitters and self.training:
             means = means + (torch.rand_like(means) - 0.5) * edges.exp()[:, None]
@@ -180,10 +206,7 @@ class WispModel(SplatModel):
     @torch.no_grad()
     def as_gaussians(self) -> GaussianModel:
         """The plain Gaussians that are drawn in eval mode, with all SH bands."""
-        values = self.numbers()
-        if self.phase != FLOAT:
-            values = self._drawn(values, self.forecast())
-        return plain_gaussians(self.means, values, self.log_edges(self.levels), self.cube, self.network)
+        return plain_gaussians(self.means, self.drawn(), self.log_edges(self.levels), self.cube, self.network)
 
     @torch.no_grad()
     def coded(self) -> Scene:
@@ -193,7 +216,7 @@ class WispModel(SplatModel):
         values[:, SIZE.columns] += (self.log_edges(self.levels) - self.log_edges(levels))[:, None]
         return Scene(
             self.cube, levels, cells, values, self.network.layers(), sh_degree=self.network.degree,
-            base_steps=tuple(self.rate.base_steps.tolist()), context=self.rate.exact(),
+            base_steps=tuple(self.rate.base_steps.tolist()), context=self.rate.exact(), in_order=self.phase == FINAL,
         )  # fmt: skip
 
     def state_dict_extra(self) -> dict[str, Any]:
@@ -205,5 +228,7 @@ class WispModel(SplatModel):
         self.phase, self.sharpness = str(extra["phase"]), float(extra["sharpness"])
         self.jitters, self.split_seed = bool(extra["jitters"]), int(extra["seed"])
         self.network.rounds = bool(extra["rounds"])
+        if self.network.rounds:
+            self.rate.round_weights()
         low = [float(x) for x in extra["low"]]
         self.cube = Cube((low[0], low[1], low[2]), float(extra["edge"]))

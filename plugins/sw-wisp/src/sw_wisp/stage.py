@@ -11,6 +11,7 @@ from torch import Tensor
 
 from splatwizard_core.api import (
     CameraIterator,
+    ContainerWriter,
     EmptyModel,
     GaussianModel,
     LossPack,
@@ -33,6 +34,7 @@ from splatwizard_core.api import (
 from sw_wisp.config import WispConfig
 from sw_wisp.conversion import converted
 from sw_wisp.cube import Cube
+from sw_wisp.file import encode
 from sw_wisp.model import WispModel
 from sw_wisp.numbers import GROUPS, LATENTS
 from sw_wisp.positions import MARGIN, levels_by_cost, middle_scales
@@ -40,6 +42,7 @@ from sw_wisp.removal import copy_some, unworthy
 from sw_wisp.rounding import FINAL, HARD, NOISE, SOFT
 from sw_wisp.worth import Worth, slopes, worth
 
+NETWORKS = ("network", "rate")
 NETWORK_EPS = 1e-8
 SENSITIVE_VIEWS = 64
 """Most views that squared slopes are measured over inside a training."""
@@ -103,29 +106,30 @@ class WispStage(Stage):
         self.set_levels(found, views, context.rasterizer, background, "begin")
         if self.config.appearance.steps == "sensitivity":
             self.set_latent_steps(found, views, context.rasterizer, background)
-        found.rate.measure(found.numbers().detach(), found.levels)
+        found.begin_rate()
         return found
 
     def create_optimizer(self, model: SplatModel, scene: Scene) -> SplatOptimizer:
+        assert isinstance(model, WispModel)
         rates = self.rates(0, scene.extent)
-        return SplatOptimizer(
-            model,
-            [ParamGroup(name, rate, eps=NETWORK_EPS if name == "network" else 1e-15) for name, rate in rates.items()],
-        )
+        eps = dict.fromkeys(NETWORKS, NETWORK_EPS)
+        if not list(model.rate.parameters()):
+            del rates["rate"]
+        return SplatOptimizer(model, [ParamGroup(name, rate, eps.get(name, 1e-15)) for name, rate in rates.items()])
 
     def rates(self, step: int, extent: float) -> dict[str, float]:
         """Learning rate of each parameter group at a step of this run; means: world units."""
         lr, share = self.config.lr, min(step / max(self.iterations, 1), 1.0)
         plans = {
             "means": lr.means, "opacity": lr.opacity, "shape": lr.shape, "size": lr.shape, "colour": lr.colour,
-            "latents": lr.latents, "network": lr.networks,
+            "latents": lr.latents, "network": lr.networks, "rate": lr.networks,
         }  # fmt: skip
         rates = {k: math.exp((1 - share) * math.log(p.first) + share * math.log(p.last)) for k, p in plans.items()}
         rates["means"] *= extent
         if step >= self.step_of(self.config.phases.place):
             rates["means"] = 0.0
         if step >= self.step_of(self.config.phases.freeze):
-            rates |= dict.fromkeys(WispModel.NUMBERS, 0.0)
+            rates |= dict.fromkeys((*WispModel.NUMBERS, "rate"), 0.0)
         return rates
 
     # Schedule
@@ -139,10 +143,13 @@ class WispStage(Stage):
         scheduler.register_task(self.when(phases.place), self.place, name="place splats in cells")
         soft = self.when(range(phases.soft, phases.hard))
         scheduler.register_task(soft, self.soften, name="soft rounding")
-        scheduler.register_task(self.when(phases.soft), self.round_network, name="eight bits in the network")
+        scheduler.register_task(self.when(phases.soft), self.round_networks, name="eight bits in networks")
         scheduler.register_task(self.when(phases.hard), self.harden, name="hard rounding")
-        measured = self.when(range(phases.noise, phases.freeze, rebuild))
-        scheduler.register_task(measured, self.measure, name="measure rate model")
+        for measured in (
+            range(phases.noise + rebuild, phases.hard, rebuild),
+            range(phases.hard, phases.freeze, max(rebuild // 2, 1)),
+        ):
+            scheduler.register_task(self.when(measured), self.measure, name="measure rate model")
         scheduler.register_task(self.when(phases.freeze), self.freeze, name="fix integers")
 
     def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
@@ -152,10 +159,12 @@ class WispStage(Stage):
     def update_lr(self, optimizer: SplatOptimizer, scene: Scene, step: int) -> None:
         """Set the step sizes."""
         for name, rate in self.rates(step, scene.extent).items():
-            optimizer.set_lr(name, rate)
+            if name in optimizer.groups:
+                optimizer.set_lr(name, rate)
 
     def begin_noise(self, model: WispModel) -> None:
         """Draw numbers with uniform noise from here on."""
+        model.begin_rate()
         model.phase = NOISE
 
     def begin_jitter(self, model: WispModel) -> None:
@@ -169,9 +178,10 @@ class WispStage(Stage):
         model.phase = SOFT
         model.sharpness = 1 + (phases.sharpness - 1) * (step - first) / max(last - 1 - first, 1)
 
-    def round_network(self, model: WispModel) -> None:
-        """Compute with the network of the file from here on."""
+    def round_networks(self, model: WispModel) -> None:
+        """Compute with the networks of the file from here on."""
         model.network.rounds = True
+        model.rate.round_weights()
 
     def harden(self, model: WispModel) -> None:
         """Draw rounded numbers from here on."""
@@ -179,7 +189,7 @@ class WispStage(Stage):
 
     def measure(self, model: WispModel) -> None:
         """Bring the rate model up to date."""
-        model.rate.measure(model.numbers(), model.levels)
+        model.measure()
 
     def fix_levels(
         self, model: WispModel, cameras: CameraIterator, rasterizer: Rasterizer, scene: Scene, step: int
@@ -192,7 +202,6 @@ class WispStage(Stage):
     def place(
         self,
         model: WispModel,
-        optimizer: SplatOptimizer,
         cameras: CameraIterator,
         rasterizer: Rasterizer,
         scene: Scene,
@@ -206,18 +215,16 @@ class WispStage(Stage):
         model.levels, cells = model.cube.settled(model.means, model.levels, model.opacity)
         model.means.copy_(model.cube.centres(model.levels, cells))
         model.jitters = False
-        optimizer.keep_rows(model, model.file_order())
         self.measure(model)
 
     def freeze(self, model: WispModel, optimizer: SplatOptimizer, log: TaskLog) -> None:
         """Round all numbers for good; splats take the order of the file, in which those of equal depth are drawn."""
         self.measure(model)
-        forecast = model.forecast()
-        values = model.numbers()
-        values = forecast.mean + forecast.steps * ((values - forecast.mean) / forecast.steps).round()
-        model.set_numbers(values)
-        optimizer.keep_rows(model, model.file_order())
+        encoded = encode(model.coded(), ContainerWriter("wisp", 1))
+        optimizer.keep_rows(model, torch.from_numpy(encoded.rows).to(model.device))
+        model.set_numbers(encoded.decoded.values().to(model.device))
         model.phase = FINAL
+        self.measure(model)
         with still(model):
             bits = model.bits().mean(0)
         parts = {"place": model.place_bits().mean()} | {group.name: bits[group.columns].sum() for group in GROUPS}
