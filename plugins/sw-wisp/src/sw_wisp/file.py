@@ -164,6 +164,7 @@ def decode(reader: ContainerReader, *, packets: int | None = None) -> Decoded:
                 stream = Reader(data)
                 walk.packet(stream, packet)
                 stream.finish()
+    walk.finish()
     return Decoded(walk.state, header.cube, header.base_steps, strengths, appearance, header.sh_degree)
 
 
