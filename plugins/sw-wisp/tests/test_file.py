@@ -14,9 +14,9 @@ from sw_wisp.numbers import BASE_STEPS, LIMITS
 from sw_wisp.packets import default_order
 
 
-def written(scene, choose=None) -> tuple[bytes, file.Encoded]:
+def written(scene) -> tuple[bytes, file.Encoded]:
     writer = ContainerWriter("wisp", 1)
-    encoded = file.encode(scene, writer, choose)
+    encoded = file.encode(scene, writer)
     return writer.to_bytes(), encoded
 
 
