@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
@@ -31,7 +31,6 @@ from sw_wisp.packets import (
     KINDS,
     MOST_PLANES,
     MOST_SUBSETS,
-    Choose,
     Context,
     Packet,
     Prediction,
@@ -93,10 +92,24 @@ class Encoded:
     decoded: Decoded
 
 
-def encode(scene: Scene, writer: ContainerWriter, choose: Choose | None = None) -> Encoded:
+class Choice(Protocol):
+    """What an encoder writes for numbers: indices [n,c] int64 for the values `wanted` [n,c], 1/4096 base steps.
+
+    rows of the scene, `columns` of the 22, and the distributions under which they are coded
+    """
+
+    def __call__(self, wanted: np.ndarray, rows: np.ndarray, columns: slice, known: Prediction) -> np.ndarray: ...
+
+
+def nearest(wanted: np.ndarray, rows: np.ndarray, columns: slice, known: Prediction) -> np.ndarray:
+    """Indices whose values are nearest to those that are wanted."""
+    return np.rint((wanted - known.mean) / known.multiplier).astype(np.int64)
+
+
+def encode(scene: Scene, writer: ContainerWriter, choice: Choice = nearest) -> Encoded:
     """Write all sections and header values of a scene.
 
-    choose  indices for a prediction, of rows in the order of the file; None: the nearest
+    choice  which indices are written: `nearest`, or what a `RateDistortion` chooses
 
     What was written is decoded again and compared. Raises ValueError for values that are not finite, cells that are
     none, or more than 16 splats in one.
@@ -119,12 +132,12 @@ def encode(scene: Scene, writer: ContainerWriter, choose: Choose | None = None) 
     strengths = np.zeros((scene.planes + 1, len(GROUPS))) if scene.strengths is None else scene.strengths
     pulled = np.rint(255 * np.clip(strengths, 0, 1)).astype(np.uint8)
 
-    def nearest(at: np.ndarray, columns: slice, known: Prediction) -> np.ndarray:
-        return np.rint((units[at, columns] - known.mean) / known.multiplier).astype(np.int64)
+    def choose(at: np.ndarray, columns: slice, known: Prediction) -> np.ndarray:
+        return choice(units[at, columns], rows[at], columns, known)
 
     sizes = {label: len(part) for label, part in zip([s for s, k in order if k == "base"], subsets, strict=True)}
     packets = [Packet(subset, kind, sizes[subset]) for subset, kind in order]
-    walk = Walk(context, shares, scene.planes, subsets, choose or nearest)
+    walk = Walk(context, shares, scene.planes, subsets, choose)
     sections = [shares.pack() + context.pack() + pulled.tobytes() + pack_layers(scene.appearance)]
     for packet in packets:
         stream = Writer()
@@ -167,6 +180,7 @@ def decode(reader: ContainerReader, *, packets: int | None = None) -> Decoded:
                 stream = Reader(data)
                 walk.packet(stream, packet)
                 stream.finish()
+    walk.finish()
     return Decoded(walk.state, header.cube, header.base_steps, strengths, appearance, header.sh_degree)
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -145,6 +145,10 @@ class Walk:
         else:
             self._view(stream, self._rows[packet.subset])
 
+    def finish(self) -> None:
+        """Predict latents that no packet holds, from all that is known: they stand at their means."""
+        self._predict(LATENTS.columns, np.flatnonzero(~self.state.has_view))
+
     def _base(self, stream: Stream, packet: Packet) -> None:
         state, number = self.state, len(self._rows)
         wanted = None if self._subsets is None else self._subsets[number]
@@ -157,9 +161,10 @@ class Walk:
                 self._predict(block, wave)
                 self._code(stream, block, wave, 0 if block == OPACITY.columns else self._planes)
             self._context.changed(wave, slice(0, LATENTS.columns.start), None, state)
-        self._predict(LATENTS.columns, rows)  # until `view` they stand at their means
 
     def _predict(self, block: slice, rows: np.ndarray) -> None:
+        if not len(rows):
+            return
         found = self._context.predict(block, rows, self.state)
         self.state.mean[rows, block] = np.clip(found.mean, -MEAN_LIMIT, MEAN_LIMIT)
         self.state.scale[rows, block] = np.clip(found.scale, 0, HIGHEST_SCALE)
@@ -197,7 +202,7 @@ class Walk:
 
     def _view(self, stream: Stream, rows: np.ndarray) -> None:
         for wave in self._waves(rows):
-            self._predict(LATENTS.columns, wave)  # again: more is known by now
+            self._predict(LATENTS.columns, wave)
             self._code(stream, LATENTS.columns, wave, 0)
             self.state.has_view[wave] = True
             self._context.changed(wave, LATENTS.columns, None, self.state)
@@ -208,11 +213,13 @@ class Walk:
         return waves(rows, self._context.waves[not is_first])
 
 
-def waves(rows: np.ndarray, count: int) -> list[np.ndarray]:
-    """Parts of `rows` by rank modulo `count`, in bit-reversed order, so that later ones lie between earlier ones."""
-    width = (count - 1).bit_length()
-    residues = sorted(range(count), key=lambda r: int(f"{r:0{width}b}"[::-1], 2) if width else 0)
-    return [rows[residue::count] for residue in residues]
+def waves(rows: Any, count: int) -> list[Any]:
+    """Parts of the rows of a subset, an array or a tensor: each of them doubles how many are known, between those.
+
+    Every 2^(count-1)th, then those in the middle, and so on; half of all rows are in the last part.
+    """
+    strides = [1 << count - 1 - number for number in range(count)]
+    return [rows[:: strides[0]], *(rows[stride :: 2 * stride] for stride in strides[1:])]
 
 
 def default_order(subsets: int, planes: int) -> tuple[tuple[int, str], ...]:

@@ -92,7 +92,11 @@ class PyramidContext:
 
     def pack(self) -> bytes:
         """Flags, prior, layers."""
-        return bytes([ADAPTIVE * self.adaptive]) + (self.prior // MEAN_UNIT).astype("<i2").tobytes() + pack_layers(self.layers)
+        return (
+            bytes([ADAPTIVE * self.adaptive])
+            + (self.prior // MEAN_UNIT).astype("<i2").tobytes()
+            + pack_layers(self.layers)
+        )
 
     @classmethod
     def unpack(cls, reader: ByteReader) -> PyramidContext:

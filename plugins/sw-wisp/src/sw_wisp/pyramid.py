@@ -34,7 +34,7 @@ FEATURES = 3 * NUMBERS + 3
 BASE, VIEW = slice(0, LATENTS.columns.start), LATENTS.columns
 PARTS = (BASE, VIEW)
 WAVES = (6, 4)
-"""Parts of the first packet, and of every other."""
+"""Parts of the packets of the first subset, and of every other."""
 
 
 class Pyramid:
