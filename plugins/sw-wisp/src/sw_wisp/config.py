@@ -128,6 +128,12 @@ class Loss(Params):
     opacity_stop: int = Field(10_501, ge=0, description="step from which on that term is gone")
 
 
+class Encode(Params):
+    """How the integers are fixed."""
+
+    rdoq: bool = Field(True, description="of each number the index that costs least in loss and bits; else the nearest")
+
+
 class Codec(OwnCodec):
     """The file of wisp, which no other codec can write."""
 
@@ -150,6 +156,7 @@ class WispConfig(Choosing):
     lr: LearningRates = Field(LearningRates(), description="step sizes")
     appearance: Appearance = Field(Appearance(), description="view dependence")
     loss: Loss = Field(Loss(), description="the rest of the loss")
+    encode: Encode = Field(Encode(), description="how the integers are fixed")
     codec: Codec = Field(Codec(), description="what writes the file")
 
     @property

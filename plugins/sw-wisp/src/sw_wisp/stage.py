@@ -34,10 +34,11 @@ from splatwizard_core.api import (
 from sw_wisp.config import WispConfig
 from sw_wisp.conversion import converted
 from sw_wisp.cube import Cube
-from sw_wisp.file import encode
+from sw_wisp.file import Choice, encode, nearest
 from sw_wisp.model import WispModel
 from sw_wisp.numbers import GROUPS, LATENTS
 from sw_wisp.positions import MARGIN, levels_by_cost, middle_scales
+from sw_wisp.rdoq import RateDistortion
 from sw_wisp.removal import copy_some, unworthy
 from sw_wisp.rounding import FINAL, HARD, NOISE, SOFT
 from sw_wisp.worth import Worth, slopes, worth
@@ -217,10 +218,22 @@ class WispStage(Stage):
         model.jitters = False
         self.measure(model)
 
-    def freeze(self, model: WispModel, optimizer: SplatOptimizer, log: TaskLog) -> None:
-        """Round all numbers for good; splats take the order of the file, in which those of equal depth are drawn."""
+    def freeze(
+        self,
+        model: WispModel,
+        optimizer: SplatOptimizer,
+        cameras: CameraIterator,
+        rasterizer: Rasterizer,
+        scene: Scene,
+        log: TaskLog,
+    ) -> None:
+        """Fix all integers as an encoder does; splats take the order of the file, which decides between equal depths."""
         self.measure(model)
-        encoded = encode(model.coded(), ContainerWriter("wisp", 1))
+        choice: Choice = nearest
+        if self.config.encode.rdoq and self.price():
+            with still(model):
+                choice = self.rate_distortion(model, cameras, rasterizer, scene.background.to(model.device))
+        encoded = encode(model.coded(), ContainerWriter("wisp", 1), choice)
         optimizer.keep_rows(model, torch.from_numpy(encoded.rows).to(model.device))
         model.set_numbers(encoded.decoded.values().to(model.device))
         model.phase = FINAL
@@ -295,6 +308,18 @@ class WispStage(Stage):
             scale = found.loss_of_error * len(views) / len(some)
             levels = levels_by_cost(squared.double() * scale, self.price(), cube.edge, rule.eta)
         model.levels = levels.clamp(rule.level_min, rule.level_max)
+
+    def rate_distortion(
+        self, model: WispModel, views: list[View], rasterizer: Rasterizer, background: Tensor
+    ) -> RateDistortion:
+        """Return what chooses indices by the loss that an error of each number makes, and the price of its bits."""
+        draws = stream(model.split_seed, "indices")
+        squared = slopes(model, WispModel.NUMBERS, views, rasterizer, background, draws)
+        found = self.worth(model, views, rasterizer, background)
+        table = torch.cat([squared[name].flatten(1) if squared[name].dim() > 1 else squared[name][:, None]
+                           for name in WispModel.NUMBERS], dim=1)  # [N,22]  # fmt: skip
+        weights = table.double().cpu().numpy() * found.loss_of_error
+        return RateDistortion(weights, self.price(), model.rate.base_steps.double().cpu().numpy())
 
     def set_latent_steps(self, model: WispModel, views: list[View], rasterizer: Rasterizer, background: Tensor) -> None:
         """Give each latent the step that makes its error in the pictures as large as that of the others."""
