@@ -227,7 +227,7 @@ class WispStage(Stage):
         scene: Scene,
         log: TaskLog,
     ) -> None:
-        """Fix all integers as an encoder does; splats take the order of the file, which decides between equal depths."""
+        """Fix all integers as an encoder does; splats take the order of the file, which decides at equal depths."""
         self.measure(model)
         choice: Choice = nearest
         if self.config.encode.rdoq and self.price():
