@@ -56,7 +56,7 @@ PARTS = {
     "sw_codecs.entropy.conditional:ConditionalGaussian.decode_into": "symbols",
     "sw_codecs.entropy.conditional_mixture:ConditionalMixture.encode": "mixtures",
     "sw_codecs.entropy.conditional_mixture:ConditionalMixture.decode": "mixtures",
-    "sw_anchors.attribute_sections:SteRound.encode": "rounding",
+    "sw_anchors.attribute_sections:symbols_of": "rounding",
 }
 """Module and attribute -> part; `{}` is the method."""
 

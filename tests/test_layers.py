@@ -86,7 +86,7 @@ def test_a_room_is_small_enough_to_follow(room):
 
 def test_core_and_native_together_stay_small():
     lines = lines_in(files_of(CORE)) + lines_in(files_of(NATIVE))
-    assert lines < 16_750, f"core and native have {lines:,} lines"
+    assert lines < 17_080, f"core and native have {lines:,} lines"
 
 
 @pytest.mark.parametrize("room", sorted(ROOMS))
@@ -131,10 +131,6 @@ CLOSURES = {
 }
 """Method -> the most modules and lines of its closure, where not (45, 4,500)."""
 CLOSURE = (45, 4_500)
-NOT_YET = {
-    "sw_hac.method": (43, 4_920),
-}
-"""Closures that are larger than that today; they may shrink, and go from here once they fit."""
 
 
 def method_modules() -> list[str]:
@@ -147,7 +143,7 @@ def method_modules() -> list[str]:
 def test_a_method_can_be_read(module):
     found, limit = Closure.of(module), CLOSURES.get(module, CLOSURE)
     print(f"{module}: {found}")
-    modules, lines = NOT_YET.get(module, limit)
+    modules, lines = limit
     assert found.modules <= modules, f"{module} has {found}, at most {modules} modules"
     assert found.lines <= lines, f"{module} has {found}, at most {lines:,} lines"
 

@@ -2,17 +2,23 @@
 
 import itertools
 from collections.abc import Iterator
+from types import SimpleNamespace
 
 import pytest
 from small_scene import WIDTH, small_scene
+from sw_anchors.params import AnchorParams
+from sw_anchors.stage import AnchorStage
+from sw_gaussians.config import GaussianTraining
 from sw_gaussians.resolution import ResolutionSampler
+from sw_gaussians.stage import ThreeDGSStage
 
-from splatwizard_core.errors import ConfigError
+from splatwizard_core.errors import ConfigError, PluginError
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.plugins.catalogue import is_ours
 from splatwizard_core.runs.config import resolve
 from splatwizard_core.streams import stream
-from splatwizard_core.training.params import PipelineParams
+from splatwizard_core.training.added_tasks import add_tasks
+from splatwizard_core.training.params import AddedTask, PipelineParams
 from splatwizard_core.training.scheduler import build_schedulers
 from splatwizard_core.training.stage import Stage
 
@@ -105,3 +111,33 @@ def test_pictures_are_whole_unless_asked_for(name):
     sampler = stage_of(name).create_sampler(small_scene(), stream(0, "sampler"))
     assert not isinstance(sampler, ResolutionSampler)
     assert sampler.next(1).camera.width == WIDTH
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_a_schedule_that_is_not_registered_is_refused(name):
+    for schedule in ("dahs", "update-lr"):  # the second one is a task, but not of picture sizes
+        with pytest.raises(ConfigError, match=f"no schedule of picture sizes is called '{schedule}'; .* none, dash"):
+            stage_of(name, pictures__schedule=schedule)
+
+
+@pytest.mark.parametrize("stage", [ThreeDGSStage, AnchorStage])
+def test_a_stage_that_was_not_given_its_schedule_is_refused(stage):
+    config = {ThreeDGSStage: GaussianTraining, AnchorStage: AnchorParams}[stage](pictures={"schedule": "dash"})
+    with pytest.raises(PluginError, match=r"does not reach the training.*pictures\.load"):
+        stage(config)
+
+
+def test_a_configured_task_draws_small_pictures_in_any_stage():
+    task = AddedTask(name="dash", steps="range(0, 600)", before_render=True, settings={"full_at": 300, "most": 2})
+    (stage,) = add_tasks([stage_of("3dgs")], [task], PLUGINS)
+    pre, _ = build_schedulers(stage, PipelineParams())
+    scene = small_scene()
+    state = SimpleNamespace(sampler=stage.create_sampler(scene, stream(0, "sampler")), scene=scene)
+    (entry,) = (entry for entry in pre.registrations if entry.name == "dash")
+    widths = []
+    for step in range(1, STEPS + 1):
+        entry.task(state)
+        widths.append(state.sampler.next(step).camera.width)
+    assert widths[0] < WIDTH
+    assert widths == sorted(widths)
+    assert widths[300:] == [WIDTH] * 300

@@ -29,7 +29,7 @@ NOTHING = {"plan": False, "table": False, "jobs": 0, "gpus": "", "device": "", "
 
 def module(name: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     monkeypatch.syspath_prepend(str(BENCHMARKS))
-    for each in ("sweep_cells", "published", "anchor_starts"):
+    for each in ("sweep_cells", "published", "anchor_starts", "removal_table"):
         monkeypatch.delitem(sys.modules, each, raising=False)
     return importlib.import_module(name)
 
@@ -367,3 +367,26 @@ def test_the_matrix_shares_its_runs_with_the_table_of_what_is_published(starts, 
 def test_a_spread_above_the_bar_is_marked(starts, data, bench, tmp_path, capsys):
     bench(starts, tmp_path / "out", "--methods", "hac", "--bar", "0.05")
     assert "APART" in capsys.readouterr().out
+
+
+def test_the_table_of_removal_has_presets_and_scores_at_equal_counts(monkeypatch, bench, tmp_path, capsys):
+    table = module("removal_table", monkeypatch)
+    words = ("--scene", "demo:tiny", "--counts", "50,90", "--grown", "200", "--scores", "removal,opacity")
+    status, fake = bench(table, tmp_path / "out", *words)
+    told = capsys.readouterr().out
+    assert status == 0
+    assert len(fake.commands) == 1
+    assert "19 cells: 19 ran" in told
+    rows = {line.split("│")[1].strip(): line.split("│")[2:5] for line in told.splitlines() if line.count("│") == 5}
+    assert set(rows) >= {"paper", "fast", "settled", "mcmc, trained on", "paper + removal", "mcmc + opacity"}
+    assert [cell.strip() for cell in rows["mcmc + removal"]] == ["35.00", "35.00 (50)", ""]
+    plan = read_plan(tmp_path / "out" / "cells.toml")
+    assert plan is not None
+    (cell,) = (c for c in table.rows_of("demo:tiny", [50], 200, ["opacity"], 1)["mcmc + opacity"][50])
+    assert set(cell.sets) == {
+        "pretrained.preset=mcmc", "pretrained.density.settings.cap=200", "prune.count=50", "prune.pruner=opacity",
+        "pretrained.density.settings.stop=25000", "pretrained.density.settings.noise_stop=1000000",
+        "pretrained.density.settings.terms_stop=1000000",
+    }  # fmt: skip
+    status, fake = bench(table, tmp_path / "out", *words)
+    assert "19 cells: 19 was there" in capsys.readouterr().out

@@ -168,7 +168,7 @@ def test_a_checkout_is_installed_from_its_folders(told, wanted, from_here, monke
 
 
 def test_what_a_package_needs_of_ours_comes_with_it(from_here, monkeypatch):
-    monkeypatch.setattr(remedies, "_is_installed", lambda name: name in ("splatwizard-core", "splatwizard-native"))
+    monkeypatch.setattr(remedies, "installed_version", lambda name: name in ("splatwizard-core", "splatwizard-native"))
     found = set(re.findall(r"plugins/(sw-[\w-]+)", as_installed("pip install sw-hac-plus")))
     assert {"sw-hac-plus", "sw-anchors", "sw-codecs", "sw-rasterizers"} <= found
     every = set(re.findall(r"plugins/(sw-[\w-]+)", as_installed("pip install 'splatwizard-core[all]'")))

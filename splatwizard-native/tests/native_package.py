@@ -39,6 +39,10 @@ class Package:
     def compilations(self) -> int:
         return self.calls.read_text().count(" -c ") if self.calls.exists() else 0
 
+    @property
+    def links(self) -> int:
+        return self.calls.read_text().count("-shared ") if self.calls.exists() else 0
+
 
 def digest_of(file: Path) -> str:
     return hashlib.sha256(file.read_bytes()).hexdigest()

@@ -136,7 +136,7 @@ def test_the_command_lines_of_a_build(package, monkeypatch, tmp_path, march):
     objects = " ".join(f"{scratch}/{name}.o" for name in ("0", "1", *(f"{arch}-0" for arch in levels), "cuda-0"))
     runtime = "".join(f"{path} " for path in toolchain.runtime_libraries())
     assert shlex.join(link) == (
-        f"g++ -v1 -shared {objects} {runtime}-o {scratch}/{library.name} -fopenmp -L {lib} -ltorch -ltorch_cpu -lc10 "
+        f"g++ -v1 -shared {objects} -o {scratch}/{library.name} {runtime}-fopenmp -L {lib} -ltorch -ltorch_cpu -lc10 "
         f"-ltorch_cuda -lc10_cuda -L {home}/lib64 -lcudart"
     )
     facts = json.loads(library.with_suffix(".json").read_text())

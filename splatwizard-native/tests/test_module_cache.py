@@ -1,5 +1,6 @@
 """The cache of compiled libraries: what makes a new one, what is found again, what is damaged or foreign."""
 
+import errno
 import json
 import os
 import sys
@@ -66,7 +67,7 @@ def test_a_damaged_library_is_rebuilt(package, damage):
         facts.write_text(json.dumps({"sha256": digest_of(library)}))
     module = package.module()
     module.load()
-    assert package.compilations == 2
+    assert package.links == 2
     assert call(module.state()["path"]) == 42
 
 
@@ -84,6 +85,19 @@ def test_a_cache_that_cannot_be_written_is_named(package, monkeypatch, tmp_path)
     monkeypatch.setenv("SPLATWIZARD_CACHE", str(tmp_path / "file" / "below"))
     with pytest.raises(NativeBuildError, match=r"cannot write .*below.*SPLATWIZARD_CACHE"):
         package.module().load()
+
+
+@needs_compiler
+def test_a_full_disk_is_named_and_left_to_the_fallback(package, monkeypatch, caplog):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(library_module.os, "replace", full)
+    assert not package.module().try_load()
+    (record,) = caplog.records
+    assert "cannot write" in record.message
+    assert "No space left on device" in record.message
+    assert "answers are guessed" in record.message
 
 
 def test_the_cache_follows_the_platforms_convention(monkeypatch, tmp_path):
@@ -128,19 +142,20 @@ def test_load_built_says_why_a_build_does_not_load(package):
 
 def test_a_library_of_another_user_is_compiled_anew(package, monkeypatch, caplog):
     library = package.module().build()
-    assert package.compilations == 1
+    (kept,) = (library.parent / "objects").iterdir()
     assert package.module().build() == library
-    assert package.compilations == 1
+    assert package.links == 1
     real = os.stat
 
     def stat(path, **kwargs):
         found = real(path, **kwargs)
-        return SimpleNamespace(st_uid=12345) if path == library and package.compilations == 1 else found
+        return SimpleNamespace(st_uid=12345) if path in (library, kept) and package.links == 1 else found
 
     monkeypatch.setattr(library_module.os, "stat", stat)
     package.module().build()
-    assert package.compilations == 2
-    assert "belongs to another user (12345): it is not loaded, but compiled anew" in caplog.text
+    assert (package.links, package.compilations) == (2, 2)
+    assert f"{library} belongs to another user (12345): it is not loaded, but compiled anew" in caplog.text
+    assert f"{kept} belongs to another user" in caplog.text
 
 
 def test_what_a_killed_build_left_is_removed_by_the_next(package):

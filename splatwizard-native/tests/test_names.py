@@ -15,7 +15,7 @@ import splatwizard_native
 @pytest.mark.parametrize("name", splatwizard_native.__all__)
 def test_each_name_is_there_and_type_checkers_see_it(name: str):
     assert getattr(splatwizard_native, name) is not None
-    source = Path(splatwizard_native.__file__).read_text(encoding="utf-8")
+    source = Path(splatwizard_native.__file__).with_suffix(".pyi").read_text(encoding="utf-8")
     assert re.search(rf"import {name} as {name}$", source, re.MULTILINE)
 
 

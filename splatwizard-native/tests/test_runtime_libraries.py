@@ -47,7 +47,7 @@ def test_a_module_runs_on_the_runtime_of_torch(flags, tmp_path, monkeypatch):
     source.write_text(SOURCE, encoding="utf-8")
     include = toolchain.torch_include_flags(cuda=False)
     tools.compile([toolchain.Job(source, tmp_path / "digits.o", (*toolchain.common_flags(), *include))], log)
-    tools.link([tmp_path / "digits.o"], made, log, cuda=False)
+    tools.link([tmp_path / "digits.o"], made, log, toolchain.torch_libraries(cuda=False))
     done = subprocess.run([sys.executable, "-c", CALL, str(made)], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.split()) == (0, ["4", "1"]), done.stderr
 

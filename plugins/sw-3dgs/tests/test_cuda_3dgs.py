@@ -51,7 +51,9 @@ def make_trainer(
     scene: Scene, config: ThreeDGSConfig | None = None, *, fuses: bool | None = False, **settings
 ) -> Trainer:
     config = config or ThreeDGSConfig(iterations=7000)
-    stage = ThreeDGSStage(config, config.density.load(load_plugins()), fuses_updates=fuses)
+    plugins = load_plugins()
+    pictures = config.pictures.load(plugins)
+    stage = ThreeDGSStage(config, config.density.load(plugins), pictures=pictures, fuses_updates=fuses)
     ppl, streams = PipelineParams(device="cuda", **settings), Streams(0)
     rasterizer = NegotiatedRasterizer(load_plugins(), device="cuda")
     assert scene.points is not None

@@ -48,7 +48,8 @@ def stage_of(**sets) -> ThreeDGSStage:
 
 def made_stage(preset: str, sets=None) -> ThreeDGSStage:
     config = resolve(ThreeDGS, preset, sets=sets).config
-    return ThreeDGSStage(config, config.density.load(load_plugins()))
+    plugins = load_plugins()
+    return ThreeDGSStage(config, config.density.load(plugins), pictures=config.pictures.load(plugins))
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from sw_codecs.entropy import rates
+from sw_codecs.entropy import further_rates, rates
 from sw_codecs.entropy.categorical import Categorical, CategoricalContext
 from sw_codecs.positions.ordering import spatial_order
 
@@ -32,8 +32,8 @@ def test_rates_and_their_gradients_agree():
         a, m, s, *mixed = moved
         found = [
             rates.gaussian_bits(a, m, s, 0.5),
-            rates.laplace_bits(a, m, s, 0.5),
-            rates.mixture_bits(a, *mixed, 0.5),
+            further_rates.laplace_bits(a, m, s, 0.5),
+            further_rates.mixture_bits(a, *mixed, 0.5),
         ]
         sum(f.sum() for f in found).backward()
         return [v.detach().cpu() for v in (*found, *(p.grad for p in moved))]

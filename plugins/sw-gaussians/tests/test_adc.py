@@ -4,7 +4,8 @@ import math
 
 import pytest
 import torch
-from sw_gaussians.density import densify_and_prune, reset_opacity, rotate
+from sw_gaussians.density.adc import densify_and_prune, reset_opacity
+from sw_gaussians.density.splitting import rotate
 from sw_gaussians.stage import increase_sh_degree
 from sw_gaussians.start import logit
 from sw_gaussians.statistics import accumulate_statistics

@@ -132,6 +132,22 @@ def test_the_regularisers_are_the_weighted_means_of_opacity_and_scale(scene):
     assert float(added.detach()) == pytest.approx(expected, rel=1e-4)
 
 
+def test_noise_and_terms_end_where_they_are_told_to(scene):
+    short = {"iterations": 300, "scale_schedule": True}
+    stage = stage_of(**short, **{"density.settings.noise_stop": 21_000, "density.settings.terms_stop": 24_000})
+    pre, _ = build_schedulers(stage, PipelineParams())
+    assert {entry.name: entry.when for entry in pre.registrations}["add noise"] == range(210)
+    plain = ThreeDGSStage(resolve(ThreeDGS, "paper").config)
+    model = method().create_model(scene, stream(0, "init"))
+    view, rasterizer = scene.train[0], NegotiatedRasterizer(load_plugins(), device="cpu")
+    result = rasterizer.render(model.gaussians(view.camera, rasterizer), view.camera, RasterOptions())
+    alone = plain.loss(model, view, result, torch.zeros(3), 1).total
+    before, after = (stage.loss(model, view, result, torch.zeros(3), step) for step in (239, 240))
+    assert float(before.total.detach()) > float(alone)
+    assert set(before.parts) - set(after.parts) == {"opacity", "scale"}
+    assert torch.equal(after.total, alone)
+
+
 def test_the_last_step_and_the_first_are_left_alone(scene):
     made = method()
     stage = made.stages()[0]

@@ -11,6 +11,7 @@ from sw_gaussians.density.budget import BudgetControl
 from sw_gaussians.resolution import (
     ResolutionPlan,
     ResolutionSampler,
+    SmallPictures,
     Spectrum,
     amplitudes,
     first_scale,
@@ -117,7 +118,8 @@ def test_statistics_of_every_round_of_the_preset_fast_are_of_one_resolution(iter
     config = GaussianTraining.model_validate({
         "iterations": iterations, "scale_schedule": True, "pictures": {"schedule": "dash"},
     })  # fmt: skip
-    stage = ThreeDGSStage(config, BudgetControl(start=900, stop=24_000, interval=750))
+    control = BudgetControl(start=900, stop=24_000, interval=750)
+    stage = ThreeDGSStage(config, control, pictures=SmallPictures)
     _, post = build_schedulers(stage, PipelineParams())
     (entry,) = (entry for entry in post.registrations if entry.name == "densify to budget")
     last = round(0.8 * iterations)

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from sw_gaussians.density import densify_and_prune
+from sw_gaussians.density.adc import densify_and_prune
 from sw_gaussians.ply import export_ply, export_ply_as_3dgs, load_ply, to_ply
 from sw_gaussians.start import gaussians_from_points, logit, surfels_from_points
 from sw_gaussians.surfels import (

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from sw_gaussians.density import densify_and_prune
+from sw_gaussians.density.adc import densify_and_prune
 from sw_gaussians.volume_mask import VolumeMaskedGaussians, mask_prune, prune_by_mask
 
 from splatwizard_core.errors import EmptyModel

@@ -5,7 +5,7 @@ import torch
 from sw_anchors.fast import sample_bits
 from sw_anchors.native import ANCHORS
 
-from sw_codecs.entropy import rates
+from sw_codecs.entropy import further_rates, rates
 from sw_hac.fast.predicted_bits import MaskKind, Predicted, mixture_bits
 from sw_hac_plus.channel_mixture import ChannelMixture
 from sw_hac_plus.fast.channel_networks import ChannelNetworks
@@ -65,7 +65,7 @@ def by_torch(x, outputs, steps, masks, counted, predicted, channel):
         base, logit = predicted.base, outputs[:, -f:]
         context = torch.cat([parts[0] / base, parts[1] / base, logit], dim=1)
         second_mean, second_scale, second_logit = channel(x[:, :f] / base, context)
-        mixed = rates.mixture_bits(
+        mixed = further_rates.mixture_bits(
             x[:, :f],
             torch.stack([logit, second_logit], -1),
             torch.stack([mean[:, :f], base * second_mean], -1),

@@ -11,7 +11,7 @@ from splatwizard_core.coding.container import ContainerReader
 from splatwizard_core.method import create_method
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.training.pipeline import TrainingStopped
-from sw_codecs.entropy.rates import mixture_bits
+from sw_codecs.entropy.further_rates import mixture_bits
 from sw_codecs.entropy.rows import RowMixture
 
 pytestmark = pytest.mark.pipeline

@@ -42,7 +42,7 @@ def test_synthetic_scenes_are_black_in_the_protocol_too():
 def test_the_opacity_network_waits_where_points_are_random(scene):
     random, given = resolved(scene).config, resolved("tandt/truck").config
     assert random.lr.mlp_opacity_early == RANDOM_START["lr.mlp_opacity_early"] < given.lr.mlp_opacity_early == 1
-    assert random.paired_offsets > given.paired_offsets
+    assert random.visible_offsets > given.visible_offsets
     assert random.random_background_until == 1_500 > given.random_background_until == 0
 
 

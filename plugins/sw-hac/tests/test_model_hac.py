@@ -122,6 +122,18 @@ def test_prediction_may_start_from_statistics():
         torch.testing.assert_close(scale.mean(0), value.std(0).clamp(min=base), atol=0.05, rtol=0.2)
 
 
+def test_a_single_huge_scale_does_not_widen_the_first_prediction():
+    model = make(n=500)
+    kept = torch.nonzero(model.kept()).squeeze(1)
+    model.start_from_statistics()
+    before = predicted(model, kept).scales[1].mean(0)
+    with torch.no_grad():
+        model.log_scales[kept[0]] = 8.0
+    model.start_from_statistics()
+    assert float(model.raw(kept)[1].detach().std(0).min()) > 100
+    torch.testing.assert_close(predicted(model, kept).scales[1].mean(0), before, atol=0.01, rtol=0.5)
+
+
 def test_predictions_in_steps_are_the_same_once_folded():
     model, rows = make(in_steps=True), torch.arange(40)
     before = predicted(model, rows)

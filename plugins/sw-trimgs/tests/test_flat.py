@@ -3,7 +3,8 @@
 import math
 
 import torch
-from sw_gaussians.density import densify_and_prune, rotate
+from sw_gaussians.density.adc import densify_and_prune
+from sw_gaussians.density.splitting import rotate
 from sw_gaussians.surfels import SurfelModel
 
 from splatwizard_core.rendering.rasterizer import RasterOptions

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from sw_gaussians.density import rotate
+from sw_gaussians.density.splitting import rotate
 from sw_gaussians.surfels import SurfelModel
 
 from splatwizard_core.errors import EmptyModel

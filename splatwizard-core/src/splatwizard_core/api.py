@@ -1,4 +1,4 @@
-"""The face of the core for methods, rasterizers, codecs, metrics and data sets: at most 83 names, stable since 0.2.
+"""The face of the core for methods, rasterizers, codecs, metrics and data sets: at most 80 names, stable since 0.2.
 
 docs/plugins.md describes each. Everything else in `splatwizard_core` may change with any release.
 """
@@ -22,7 +22,7 @@ MODULES = {
     "gaussians.splat_model": "SplatModel",
     "gaussians.model": "GaussianModel",
     "gaussians.invalid_rows": "LeftOut leave_out_senseless",
-    "gaussians.placement": "origin_of placed_in world_shift",
+    "gaussians.placement": "placed_in",
     "gaussians.inputs": "GaussianInputs SH SH_C0 rgb_to_dc",
     "rendering.rasterizer": "Rasterizer RasterOptions RenderResult RasterStats AccumOutput GradBuffer ScoreSpec",
     "rendering.features": "Feature",
@@ -50,7 +50,9 @@ MODULES = {
     "evaluation.metrics": "MetricSetup PreparedMetric",
 }
 """Module of the core -> the names that it lends. `api.pyi` repeats them for type checkers."""
-BASE = {"errors": "ForeseenError", "files": "replacing", "progress": "track"}
+BASE = {"files": "replacing", "progress": "track"}
 """The same of splatwizard-native."""
+OLDER = {"gaussians.placement": "origin_of world_shift"}
+"""Names of 0.2 that go with 0.4."""
 
-__all__, __getattr__ = lazy_exports(__name__, MODULES, BASE)
+__all__, __getattr__ = lazy_exports(__name__, MODULES, BASE, OLDER)

@@ -31,9 +31,7 @@ from splatwizard_core.gaussians.inputs import rgb_to_dc as rgb_to_dc
 from splatwizard_core.gaussians.invalid_rows import LeftOut as LeftOut
 from splatwizard_core.gaussians.invalid_rows import leave_out_senseless as leave_out_senseless
 from splatwizard_core.gaussians.model import GaussianModel as GaussianModel
-from splatwizard_core.gaussians.placement import origin_of as origin_of
 from splatwizard_core.gaussians.placement import placed_in as placed_in
-from splatwizard_core.gaussians.placement import world_shift as world_shift
 from splatwizard_core.gaussians.splat_model import SplatModel as SplatModel
 from splatwizard_core.method import Method as Method
 from splatwizard_core.method import create_method as create_method
@@ -78,6 +76,5 @@ from splatwizard_core.training.stage import Stage as Stage
 from splatwizard_core.training.stage import StageContext as StageContext
 from splatwizard_core.training.state import TrainingState as TrainingState
 from splatwizard_core.training.task_log import TaskLog as TaskLog
-from splatwizard_native.errors import ForeseenError as ForeseenError
 from splatwizard_native.files import replacing as replacing
 from splatwizard_native.progress import track as track

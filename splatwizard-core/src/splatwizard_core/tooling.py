@@ -49,7 +49,11 @@ MODULES = {
     "plugins.remedies": "as_installed",
 }
 """Module of the core -> the names that it lends. `tooling.pyi` repeats them for type checkers."""
-BASE = {"files": "bytes_with_named file_sha256 new_folder write_atomic write_json", "progress": "Bar"}
+BASE = {
+    "errors": "ForeseenError",
+    "files": "bytes_with_named file_sha256 new_folder write_atomic write_json",
+    "progress": "Bar",
+}
 """The same of splatwizard-native."""
 
 __all__, __getattr__ = lazy_exports(__name__, MODULES, BASE)

@@ -7,8 +7,8 @@ import torch
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import UserInputError
-from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.gaussians.placement import as_origin, in_world, origin_of, placed_in, with_origin, world_shift
+from splatwizard_core.gaussians.model import GaussianModel, as_origin
+from splatwizard_core.gaussians.placement import in_world, placed_in, with_origin
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.scene.scene import Protocol, Scene
 
@@ -43,7 +43,7 @@ def test_a_model_that_says_where_it_stands_is_moved_to_the_scenes_origin():
     with_origin(model, FAR)
     placed_in(model, scene_at((448260.0, 5411933.0, 30.0)))
     torch.testing.assert_close(model.means, model_at((2.0, 0.0, 5.0)).means)
-    assert origin_of(model) == (448260.0, 5411933.0, 30.0)
+    assert model.world_origin == (448260.0, 5411933.0, 30.0)
 
 
 def test_scenes_about_0_leave_models_alone():
@@ -59,8 +59,8 @@ def test_the_world_is_asked_for_only_where_it_is_known():
     with pytest.raises(UserInputError, match=r"--world: m\.swz holds no explicit Gaussians .but Anchors.*sw bake"):
         in_world(type("Anchors", (SplatModel,), {})(), "m.swz")
     with_origin(model, FAR)
-    assert world_shift(model) is None
-    assert world_shift(in_world(model, "m.ply")) == FAR
+    assert model.world_shift is None
+    assert in_world(model, "m.ply").world_shift == FAR
 
 
 @pytest.mark.parametrize("value", [None, 3, "abc", [1, 2], [1, 2, "3"], [1.0, 2.0, float("nan")], [True, 1, 2], {}])

@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import hashlib
 import json
 import logging
 import os
+import shutil
+import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from splatwizard_native.errors import DiskFullError
+from splatwizard_native.face import ABI
+from splatwizard_native.files import write_atomic
 from splatwizard_native.waiting import watch_cores
 
 log = logging.getLogger(__name__)
+
+KEPT_SECONDS = 7 * 86_400.0
 
 
 def install(built: Path, library: Path, facts: dict[str, Any]) -> None:
@@ -22,20 +32,44 @@ def install(built: Path, library: Path, facts: dict[str, Any]) -> None:
     os.replace(written, library.with_suffix(".json"))
 
 
+def fetch(kept: Path, output: Path) -> bool:
+    """Copy an object of an earlier build to `output`, and say whether there was one."""
+    with contextlib.suppress(OSError):
+        if _is_trusted(kept):
+            shutil.copyfile(kept, output)
+            os.utime(kept)
+            return True
+    return False
+
+
+def keep(output: Path, kept: Path) -> None:
+    """Keep an object for later builds, if there is space, and forget those of the folder that none used for a while."""
+    with contextlib.suppress(OSError, DiskFullError):
+        kept.parent.mkdir(exist_ok=True)
+        write_atomic(kept, output.read_bytes())
+        for other in kept.parent.iterdir():
+            if other.stat().st_mtime < time.time() - KEPT_SECONDS:
+                other.unlink()
+
+
 def is_intact(library: Path) -> bool:
     """Whether the file is the one that the build wrote, and nobody else's.
 
     A truncated library may load and crash the process later; one of another user may do anything.
     """
     try:
-        # Whoever installed this code may bring libraries too.
-        trusted = {os.getuid(), 0, os.stat(__file__).st_uid} if hasattr(os, "getuid") else {os.stat(library).st_uid}
-        if (owner := os.stat(library).st_uid) not in trusted:
-            log.warning("%s belongs to another user (%s): it is not loaded, but compiled anew", library, owner)
-            return False
-        return _facts(library).get("sha256") == _sha256(library)
+        return _is_trusted(library) and _facts(library).get("sha256") == _sha256(library)
     except OSError:
         return False
+
+
+def _is_trusted(file: Path) -> bool:
+    # Whoever installed this code may bring libraries too.
+    trusted = {os.getuid(), 0, os.stat(__file__).st_uid} if hasattr(os, "getuid") else {os.stat(file).st_uid}
+    if (owner := os.stat(file).st_uid) not in trusted:
+        log.warning("%s belongs to another user (%s): it is not loaded, but compiled anew", file, owner)
+        return False
+    return True
 
 
 def architectures_of(library: Path | None) -> list[str]:
@@ -53,6 +87,22 @@ def load_ops(library: Path) -> str | None:
         return str(error.__cause__ or error)
     watch_cores()
     return None
+
+
+def open_face(library: Path, name: str, source_hash: str, symbols: Iterable[str]) -> ctypes.CDLL:
+    """Open a library with a plain C face. Raises OSError if it is none, or one of other sources."""
+    opened = ctypes.CDLL(str(library))
+    try:
+        abi, told = getattr(opened, f"{name}_abi")(), getattr(opened, f"{name}_hash")
+        getattr(opened, f"{name}_last_error").restype = told.restype = ctypes.c_char_p
+        for symbol in symbols:
+            getattr(opened, symbol)
+    except AttributeError as error:
+        raise OSError(str(error)) from error
+    if (abi, told()) != (ABI, source_hash.encode()):
+        raise OSError(f"it is of ABI {abi} and sources {told().decode()}, not {ABI} and {source_hash}")
+    watch_cores()
+    return opened
 
 
 def _facts(library: Path) -> dict[str, Any]:

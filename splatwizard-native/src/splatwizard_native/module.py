@@ -1,6 +1,6 @@
 """Native modules: C++ and CUDA sources that ship with a package, found prebuilt, cached, or compiled on first use.
 
-A module registers its ops with TORCH_LIBRARY in one thin binding file; after `load()` they are at torch.ops.<name>.
+A module has a plain C face (docs/native.md), or registers ops with TORCH_LIBRARY: they are at torch.ops.<name>.
 Environment: SPLATWIZARD_CACHE (where builds go), SPLATWIZARD_NATIVE=0 (do without native code),
 SPLATWIZARD_BUILD_TIMEOUT (seconds to wait for another process's build), CXX, CUDA_HOME, TORCH_CUDA_ARCH_LIST (compute
 capabilities to build for, as "8.0;9.0"; without it those of the GPUs here), MAX_JOBS.
@@ -8,25 +8,27 @@ capabilities to build for, as "8.0;9.0"; without it those of the GPUs here), MAX
 
 from __future__ import annotations
 
+import ctypes
+import functools
 import hashlib
+import importlib.metadata
 import importlib.util
 import itertools
-import json
 import logging
 import platform
 import shutil
-import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from splatwizard_native import cuda_toolkit, toolchain
 from splatwizard_native.errors import NativeBuildError
-from splatwizard_native.library import architectures_of, install, is_intact, load_ops
+from splatwizard_native.face import ABI, OPERATION
+from splatwizard_native.library import architectures_of, fetch, install, is_intact, keep, load_ops, open_face
 from splatwizard_native.lock import build_lock
 from splatwizard_native.settings import SWITCHED_OFF, build_timeout, cache_root, switched_off
 from splatwizard_native.toolchain import Job, Toolchain
@@ -43,10 +45,12 @@ Say = Callable[[str], None]
 class _Session:
     """State of a module in this process, shared by all: a loaded library cannot be unloaded.
 
+    library what was loaded, if it has a plain C face
     cuda    whether it holds CUDA kernels; None: nobody has asked yet
     """
 
     loaded: Path | None = None
+    library: ctypes.CDLL | None = None
     error: NativeBuildError | None = None
     warned: bool = False
     cuda: bool | None = None
@@ -54,18 +58,18 @@ class _Session:
 
 @dataclass(frozen=True)
 class NativeModule:
-    """One shared library with torch ops, described by its sources.
+    """One shared library, described by its sources.
 
-    name            also the TORCH_LIBRARY namespace: the ops are torch.ops.<name>.*
+    name            also the TORCH_LIBRARY namespace: the ops are torch.ops.<name>.*; or what C functions begin with
     package         import package whose folder the paths below are relative to
-    sources         C++ files compiled once: the binding file
+    sources         C++ files compiled once: the binding file, or what stands behind the face
     kernels         C++ files compiled once per instruction set, in `namespace SW_ARCH` (<splatwizard/dispatch.h>);
                     they see no torch header
     headers         every header that the files above include from the package; globs are allowed
+    face            header of a plain C face (<splatwizard/c_face.h>): one binary for any torch; none: torch ops
+    cuda            torch ops of a module with a face for tensors on a GPU, as a library of its own
     cuda_sources    .cu files, compiled (with SW_WITH_CUDA defined everywhere) only if torch has CUDA and nvcc is there
     cflags          more flags for sources and kernels
-    seconds         how long it takes to compile beside other modules; what the user is told comes from builds that were
-                    measured on this machine
     without         what happens without this module, told to the user when it cannot be built
     """
 
@@ -76,12 +80,13 @@ class NativeModule:
     cuda_sources: tuple[str, ...] = ()
     cflags: tuple[str, ...] = ()
     kernels: tuple[str, ...] = ()
-    seconds: int = 30
     without: str = ""
+    face: str = ""
+    cuda: NativeModule | None = None
     _session: _Session = field(default_factory=_Session, init=False, repr=False, compare=False)
 
     def load(self, *, say: Say | None = None) -> None:
-        """Make torch.ops.<name> usable: prebuilt, cached, or compiled now with a line of progress through `say`.
+        """Make the operations usable: prebuilt, cached, or compiled now with a line of progress through `say`.
 
         Raises NativeBuildError with the reason and what to do; a second call raises it again without compiling.
         """
@@ -111,6 +116,8 @@ class NativeModule:
 
     def has_cuda(self) -> bool:
         """Load, and say whether there are CUDA kernels; if not, warn once. For code that has a torch fallback."""
+        if self.cuda is not None:
+            return self.cuda.has_cuda()
         session = self._session
         if session.cuda is None:
             if session.loaded is None and switched_off():
@@ -128,16 +135,32 @@ class NativeModule:
         if self._session.loaded is None:
             if switched_off():
                 raise NativeBuildError(SWITCHED_OFF)
-            problems = []
+            for library in self._places():
+                if library.exists() and not is_intact(library):
+                    _warn_once(f"{library} is damaged, and not loaded")
+            problems: list[str] = []
             for library in self._existing():
-                problem = load_ops(library)
+                problem = self._open(library)
                 if problem is None:
-                    self._session.loaded = library
+                    for each in problems:
+                        _warn_once(f"{each}; another one is loaded")
                     return True
                 problems.append(f"{library} does not load: {problem}")
             if problems:
                 raise NativeBuildError("; ".join(problems))
         return self._session.loaded is not None
+
+    @property
+    def library(self) -> ctypes.CDLL:
+        """Return the library of a module with a face, loaded now if it is not yet. Raises NativeBuildError."""
+        self.load()
+        assert self._session.library is not None, f"'{self.name}' has no plain C face"
+        return self._session.library
+
+    @property
+    def face_header(self) -> str:
+        """Return the text of the header that C and Python read."""
+        return (self._root() / self.face).read_text("utf-8")
 
     def available(self, *, cuda: bool = False) -> str | None:
         """The reason why `load` would fail, or with `cuda` give no CUDA kernels; or None.
@@ -145,6 +168,8 @@ class NativeModule:
         Compiles nothing: a compiler that is there is taken to work.
         """
         session = self._session
+        if cuda and self.cuda is not None:
+            return self.cuda.available(cuda=True)
         if session.error is not None:
             return str(session.error)
         try:
@@ -202,7 +227,7 @@ class NativeModule:
             folder.mkdir(parents=True, exist_ok=True)
             with build_lock(library.with_suffix(".lock"), timeout=build_timeout(), say=say or _say):
                 if force or not is_intact(library):
-                    self._compile(library, march, tools or Toolchain(), say or _say)
+                    self._compile(library, march, tools or Toolchain(), say or _say, force)
         except NativeBuildError as error:
             raise self._failure(error) from error
         except OSError as error:
@@ -221,7 +246,7 @@ class NativeModule:
         return cache_root() / "native"
 
     def key(self, march: str, cuda: bool | None = None, *, any_gpu: bool = False) -> str:
-        """Digest of all that the binary depends on: torch, CUDA or cpu, ABI, CPU if native, flags, the sources.
+        """Digest of all that the binary depends on: torch and CUDA if it uses them, the CPU if native, flags, sources.
 
         cuda        with CUDA kernels or without; None: as a build here would be
         any_gpu     leave the GPUs' architectures out: a binary in a package says itself which ones it holds
@@ -231,13 +256,21 @@ class NativeModule:
         cuda = self._with_cuda() if cuda is None else cuda
         # The empty flags at the two ends are those of linker and nvcc: modules had some, and older builds stay valid.
         facts: list[object] = [
-            self.name, str(torch.__version__), toolchain.common_flags(), platform.system(), platform.machine(), march,
+            self.name, f"ABI {ABI}" if self.face else str(torch.__version__), self._common_flags(), platform.system(),
+            platform.machine(), march,
             toolchain.arch_variants(march), toolchain.cpu_identity() if march == "native" else "", self.cflags, (),
         ]  # fmt: skip
         if cuda:
             facts += [torch.version.cuda, () if any_gpu else cuda_toolkit.architectures(), ()]
+        return self._digest(facts, self._files(cuda))
+
+    def source_hash(self) -> str:
+        """Digest of sources and flags, whatever compiles them: a library with a face tells it."""
+        return self._digest([self.name, ABI, self.cflags], self._files(False))
+
+    def _digest(self, facts: list[object], files: Sequence[Path]) -> str:
         digest = hashlib.sha256(repr(facts).encode())
-        for path in self._files(cuda):
+        for path in files:
             try:
                 content = path.read_bytes()
             except OSError as error:
@@ -252,12 +285,24 @@ class NativeModule:
             if self.load_built():
                 return
         except NativeBuildError as error:
-            log.debug("%s", error)
+            log.warning("%s; it is compiled anew", error)
         library = self.build(force=self.is_built("native"), say=say)
-        problem = load_ops(library)
+        problem = self._open(library)
         if problem is not None:
             raise self._failure(f"{library} was compiled but does not load: {problem}")
+
+    def _open(self, library: Path) -> str | None:
+        """Load a library; the reason if that fails."""
+        if self.face:
+            symbols = [f"{module}_{operation}" for module, operation in OPERATION.findall(self.face_header)]
+            try:
+                self._session.library = open_face(library, self.name, self.source_hash(), symbols)
+            except OSError as error:
+                return str(error)
+        elif (problem := load_ops(library)) is not None:
+            return problem
         self._session.loaded = library
+        return None
 
     def _existing(self) -> Iterator[Path]:
         """Undamaged libraries for this machine and these sources, best first."""
@@ -303,10 +348,13 @@ class NativeModule:
             return f"module '{self.name}' has no CUDA kernels"
         return cuda_toolkit.toolkit_mismatch()
 
+    def _common_flags(self) -> tuple[str, ...]:
+        return toolchain.plain_flags() if self.face else toolchain.common_flags()
+
     def _jobs(self, march: str, objects: Path) -> list[Job]:
         root, cuda = self._root(), self._with_cuda()
         variants = toolchain.arch_variants(march)
-        shared = [*toolchain.common_flags()]
+        shared = [*self._common_flags()]
         if cuda:
             shared.append("-DSW_WITH_CUDA")
         if "arch_v2" in variants:
@@ -314,8 +362,15 @@ class NativeModule:
         # The binding runs on every machine that the binary is for, so it gets the lowest of the variants.
         lowest = next(iter(variants.values()))
         include = toolchain.SHARED_INCLUDE_FLAGS
-        binding = (*shared, *lowest, *include, *toolchain.torch_include_flags(cuda=cuda), *self.cflags)
-        jobs = [Job(root / s, objects / f"{i}.o", binding) for i, s in enumerate(self.sources)]
+        torchs = () if self.face else toolchain.torch_include_flags(cuda=cuda)
+        binding = (*shared, *lowest, *include, *torchs, *self.cflags)
+        sources = [root / s for s in self.sources]
+        if self.face:
+            sources.append(objects / f"{self.name}.cpp")
+            sources[-1].write_text(
+                f'#include <splatwizard/c_face.h>\nSW_FACE({self.name}, "{self.source_hash()}")\n', "utf-8"
+            )
+        jobs = [Job(source, objects / f"{i}.o", binding) for i, source in enumerate(sources)]
         # Lowest level first: of inline functions that several objects emit the linker keeps the first, and that
         # one must run on every machine.
         for arch, flags in variants.items():
@@ -328,10 +383,18 @@ class NativeModule:
             jobs += [Job(root / s, objects / f"cuda-{i}.o", flags, cuda=True) for i, s in enumerate(self.cuda_sources)]
         return jobs
 
-    def _compile(self, library: Path, march: str, tools: Toolchain, say: Say) -> None:
-        expected = self.expected_seconds(march)
-        about = "" if expected is None else f", about {expected:.0f} s by earlier builds here"
-        say(f"compiling kernels '{self.name}' (once{about}) ...")
+    def _kept(self, jobs: Sequence[Job], compiler: str) -> list[Path]:
+        """Where objects are kept, by all that they depend on, so that one changed file is compiled alone."""
+        headers = [path for path in self._files(self._with_cuda()) if path.suffix == ".h"]
+        folder, torchs = self.cache_folder / "objects", "" if self.face else importlib.metadata.version("torch")
+        places = []
+        for job in jobs:
+            facts: list[object] = [compiler, torchs, [f for f in job.flags if f != str(toolchain.SHARED_INCLUDE)]]
+            places.append(folder / f"{job.source.stem}-{self._digest(facts, [job.source, *headers])}.o")
+        return places
+
+    def _compile(self, library: Path, march: str, tools: Toolchain, say: Say, force: bool) -> None:
+        say(f"compiling kernels '{self.name}' (once) ...")
         started, cuda = time.monotonic(), self._with_cuda()
         build_log = library.with_suffix(".log")
         build_log.unlink(missing_ok=True)
@@ -340,41 +403,27 @@ class NativeModule:
             shutil.rmtree(left, ignore_errors=True)
         with tempfile.TemporaryDirectory(dir=library.parent, prefix=prefix) as scratch:
             jobs = self._jobs(march, Path(scratch))
+            kept = dict(zip(jobs, self._kept(jobs, tools.version()), strict=True))
+            missing = [job for job, place in kept.items() if force or not fetch(place, job.output)]
             built = Path(scratch) / library.name
             try:
-                tools.compile(jobs, build_log)
-                tools.link([j.output for j in jobs], built, build_log, cuda=cuda)
+                tools.compile(missing, build_log)
+                self._check_headers(missing)
+                plain = toolchain.plain_libraries(march) if self.face else toolchain.torch_libraries(cuda=cuda)
+                tools.link([j.output for j in jobs], built, build_log, plain)
             except NativeBuildError as error:
                 raise NativeBuildError(f"\n{error}\nfull log: {build_log}") from error
-            self._check_headers(jobs)
+            for job in missing:
+                keep(job.output, kept[job])
             seconds = round(time.monotonic() - started, 1)
             facts = {
                 "seconds": seconds,
-                "share": self.seconds,
                 "compiler": tools.version(),
                 "march": march,
                 "architectures": cuda_toolkit.architectures() if cuda else [],
             }
             install(built, library, facts)
         say(f"compiled kernels '{self.name}' in {seconds:.0f} s")
-
-    def expected_seconds(self, march: str = "native") -> float | None:
-        """Return how long a build takes, by those that were measured here: its own last one, else as others went.
-
-        None: there is none of this kind.
-        """
-        cuda, mine, others = self._with_cuda(), [], []
-        for file in sorted(self.cache_folder.glob("*.json"), key=lambda path: path.stat().st_mtime):
-            try:
-                facts = json.loads(file.read_text("utf-8"))
-                if facts["march"] != march or bool(facts["architectures"]) != cuda:
-                    continue
-                if file.name.startswith(f"{self.name}-"):
-                    mine.append(float(facts["seconds"]))
-                others.append(float(facts["seconds"]) / float(facts["share"]))
-            except (OSError, ValueError, KeyError, TypeError, ZeroDivisionError):
-                continue  # of another release, or damaged
-        return mine[-1] if mine else statistics.median(others) * self.seconds if others else None
 
     def _check_headers(self, jobs: list[Job]) -> None:
         """A header of the package that is not declared would let a stale build pass for a fresh one."""
@@ -383,7 +432,7 @@ class NativeModule:
         for job in jobs:
             for path in toolchain.read_dependencies(Path(f"{job.output}.d")):
                 resolved = path.resolve()
-                if resolved.is_relative_to(root) and resolved not in known:
+                if resolved.is_relative_to(root) and resolved not in known and path != job.source:
                     raise NativeBuildError(
                         f"{job.source.name} includes {resolved.relative_to(root)}, which the module does not declare: "
                         "add it to headers"
@@ -392,6 +441,11 @@ class NativeModule:
     def _failure(self, reason: object) -> NativeBuildError:
         without = f"\nwithout them: {self.without}" if self.without else ""
         return NativeBuildError(f"kernels '{self.name}' are not available: {reason}{without}")
+
+
+@functools.cache
+def _warn_once(message: str) -> None:
+    log.warning("%s", message)
 
 
 def _say(message: str) -> None:

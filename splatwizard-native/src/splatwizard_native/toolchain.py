@@ -81,8 +81,13 @@ def cpu_identity() -> str:
     return repr([(key, " ".join(sorted(told[key].split()))) for key in wanted if key in told])
 
 
+def plain_flags() -> tuple[str, ...]:
+    """C++ flags of a module with a plain C face."""
+    return ("-std=c++20", "-O3", "-fPIC", "-fvisibility=hidden", "-fopenmp-simd", "-pthread")
+
+
 def common_flags() -> tuple[str, ...]:
-    """C++ flags of every file."""
+    """C++ flags of a module of torch ops."""
     import torch
 
     flags = ["-std=c++20", "-O3", "-fPIC", f"-D_GLIBCXX_USE_CXX11_ABI={int(torch._C._GLIBCXX_USE_CXX11_ABI)}"]
@@ -145,17 +150,9 @@ class Toolchain:
         for run in runs:
             run.result()
 
-    def link(self, objects: Iterable[Path], output: Path, log: Path, *, cuda: bool) -> None:
-        """Link a shared library against torch's libraries."""
-        import torch
-
-        libraries = ["-L", str(Path(torch.__file__).parent / "lib"), "-ltorch", "-ltorch_cpu", "-lc10"]
-        nvcc = cuda_toolkit.find_nvcc() if cuda else None
-        if nvcc is not None:
-            libraries += ["-ltorch_cuda", "-lc10_cuda", "-L", str(cuda_toolkit.root_of(nvcc) / "lib64"), "-lcudart"]
-        extra = ["-fopenmp"] if sys.platform != "darwin" else ["-undefined", "dynamic_lookup"]
-        first = [*map(str, objects), *runtime_libraries()]
-        command = [*self.compiler, "-shared", *first, "-o", str(output), *extra, *libraries]
+    def link(self, objects: Iterable[Path], output: Path, log: Path, libraries: Sequence[str]) -> None:
+        """Link a shared library."""
+        command = [*self.compiler, "-shared", *map(str, objects), "-o", str(output), *libraries]
         try:
             self._pool.submit(self._compilers.run, command, log).result()
         except NativeBuildError:
@@ -168,6 +165,25 @@ class Toolchain:
         """End the compilers that run, with the processes that they started, and start no other."""
         self._pool.shutdown(wait=False, cancel_futures=True)
         self._compilers.stop()
+
+
+def torch_libraries(*, cuda: bool) -> list[str]:
+    """Return what links a library against torch's, after the C++ runtime of this process."""
+    import torch
+
+    libraries = ["-L", str(Path(torch.__file__).parent / "lib"), "-ltorch", "-ltorch_cpu", "-lc10"]
+    nvcc = cuda_toolkit.find_nvcc() if cuda else None
+    if nvcc is not None:
+        libraries += ["-ltorch_cuda", "-lc10_cuda", "-L", str(cuda_toolkit.root_of(nvcc) / "lib64"), "-lcudart"]
+    extra = ["-fopenmp"] if sys.platform != "darwin" else ["-undefined", "dynamic_lookup"]
+    return [*runtime_libraries(), *extra, *libraries]
+
+
+def plain_libraries(march: str) -> list[str]:
+    """Return what links a library with a plain C face: a portable one brings its C++ runtime, and shows none of it."""
+    if march == "portable" and sys.platform == "linux":
+        return ["-pthread", "-static-libstdc++", "-static-libgcc", "-Wl,--exclude-libs,ALL"]
+    return [*runtime_libraries(), "-pthread"]
 
 
 def runtime_libraries() -> list[str]:

@@ -53,4 +53,6 @@ class TwoDGS(GaussianMethod):
         )  # fmt: skip
 
     def stages(self) -> Sequence[Stage]:
-        return [TwoDGSStage(self.config, self.config.density.load(self.plugins))]
+        config: TwoDGSConfig = self.config
+        control, pictures = config.density.load(self.plugins), config.pictures.load(self.plugins)
+        return [TwoDGSStage(config, control, pictures=pictures)]

@@ -14,6 +14,7 @@ from splatwizard_core.api import ConfigError, RasterOptions
 from sw_2dgs.datasets import OTHER, surface_of
 
 if TYPE_CHECKING:
+    from sw_gaussians.pictures import PictureSizes
     from torch import Tensor
 
     from splatwizard_core.api import DensityControl, LossPack, RenderResult, SplatModel, StageContext, View
@@ -30,8 +31,10 @@ class TwoDGSStage(ThreeDGSStage):
 
     name = "2dgs"
 
-    def __init__(self, opt: TwoDGSConfig, control: DensityControl | None = None) -> None:
-        super().__init__(opt, control)
+    def __init__(
+        self, opt: TwoDGSConfig, control: DensityControl | None = None, *, pictures: PictureSizes | None = None
+    ) -> None:
+        super().__init__(opt, control, pictures=pictures)
         self.settings = opt.surface
         self.surface = self._configured(OTHER)
         self._drawn: dict[tuple[bool, bool], RasterOptions] = {}  # by the losses that are on

@@ -49,7 +49,8 @@ class ThreeDGS(GaussianMethod):
 
     def stages(self) -> Sequence[Stage]:
         config: ThreeDGSConfig = self.config
-        return [ThreeDGSStage(config, config.density.load(self.plugins), fuses_updates=config.fused_updates)]
+        control, pictures = config.density.load(self.plugins), config.pictures.load(self.plugins)
+        return [ThreeDGSStage(config, control, pictures=pictures, fuses_updates=config.fused_updates)]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         """Write the model with the chosen codec; the header names it in `mode`, other codecs in `codec`."""

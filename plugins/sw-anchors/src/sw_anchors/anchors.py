@@ -95,16 +95,24 @@ class AnchorSplats(SplatModel):
             setattr(self, name, two_layers(features + 4, hidden, outputs * offsets, generator).to(like))
 
     @torch.no_grad()
-    def pair_offsets(self) -> None:
-        """Initialise the opacity network so that offset j + k/2 gets minus the output of j (odd k: except the last).
+    def show_offsets(self, count: int, eyes: Tensor) -> None:
+        """Initialise the opacity network so that `count` offsets of an anchor are visible, at most half of them.
+
+        eyes    [C,3] camera centres
 
         New anchors have equal features, so an offset is visible for all anchors or for none. With random weights the
-        number of visible offsets (of ten) depends on the seed: 1.6 to 8.7 on average over views.
+        number of visible offsets (of ten) depends on the seed: 1.6 to 8.7 on average over views. Here offset
+        `count` + j gets minus the output of j < `count`; of the others, those that are positive on average change sign.
         """
-        _, last = linear_layers(self.mlp_opacity)
-        half = self.num_offsets // 2
+        first, last = linear_layers(self.mlp_opacity)
+        count = min(count, self.num_offsets // 2)
+        toward = self.positions().mean(dim=0) - eyes.to(first.weight)
+        distance = torch.linalg.vector_norm(toward, dim=1, keepdim=True)
+        features = first.weight.new_zeros(len(eyes), first.in_features - 4)
+        outputs = self.mlp_opacity(torch.cat([features, toward / distance, distance], dim=1)).mean(dim=0)
         for parameter in (last.weight, last.bias):
-            parameter[half : 2 * half] = -parameter[:half]
+            parameter[outputs > 0] = -parameter[outputs > 0]
+            parameter[:count] = -parameter[count : 2 * count]
 
     @property
     def num_offsets(self) -> int:

@@ -21,7 +21,7 @@ from sw_anchors.shape import GROUPS, AnchorShape
 from sw_codecs.context.integer_mlp import FRACTION, IntegerMlp
 from sw_codecs.entropy.exact_tables import step_multipliers
 from sw_codecs.entropy.rows import RowContext, RowLattice
-from sw_codecs.quantizers.rounding import SteRound
+from sw_codecs.quantizers.multiples import symbols_of
 
 if TYPE_CHECKING:
     from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager
@@ -86,11 +86,10 @@ class AttributeEncoder(AttributeCoder):
         self._values = dict(zip(GROUPS, (v.detach().cpu() for v in model.raw(rows)), strict=True))
         self._centres = dict(zip(GROUPS, (c.cpu() for c in model.centres()), strict=True))
         self._coded: dict[str, list[bytes]] = {name: [] for name in sections}
-        self._round = SteRound()
 
     def code(self, block: Block, context: Any, step: Tensor, present: Tensor | None = None) -> Tensor:
         values = self._values[block.group][block.rows, block.columns].double()
-        symbols, _ = self._round.encode(values, step, mean=self._centres[block.group])
+        symbols = symbols_of(values, step, self._centres[block.group])
         symbols = symbols if present is None else symbols * present
         coder = self.further.get(type(context), self.coder)
         self._coded[block.section].append(coder.encode(symbols.numpy(), context, present))

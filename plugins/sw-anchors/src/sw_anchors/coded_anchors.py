@@ -21,8 +21,8 @@ from sw_anchors.noisy_values import MASK_THRESHOLD, Noise, NoisyValues, draws, n
 from sw_anchors.noisy_values import QUANTIZED as QUANTIZED
 from sw_anchors.older_coded_anchors import PredictedRate
 from sw_anchors.rate_model import AnchorRate, Context, Floors, RateModel, Triple, triple
-from sw_codecs.quantizers.binary import SteMask
-from sw_codecs.quantizers.rounding import SteRound
+from sw_codecs.quantizers.multiples import nearest_index
+from sw_codecs.quantizers.straight_through import hard_mask
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Camera, GaussianInputs, Rasterizer
@@ -82,7 +82,6 @@ class CodedAnchors(AnchorModel):
         self.base_steps, self.noise_factor = base_steps, noise_factor
         self.sample, self.smallest_probability = sample, smallest_probability
         self.scale_floor = scale_floor
-        self._mask, self._round = SteMask(MASK_THRESHOLD), SteRound()
         self._lattice: tuple[tuple[Any, ...], Tensor, Tensor] | None = None
         self._steps: dict[tuple[Any, ...], Tensor] = {}
 
@@ -129,7 +128,7 @@ class CodedAnchors(AnchorModel):
     def masks(self, rows: Tensor | None = None) -> Tensor:
         """Return binary masks [V,k] with the gradient of `soft_masks`; rows None: all."""
         weights = self.mask_weights()
-        masks = self._mask.forward(self.mask_logits, 1.0 if weights is None else weights)
+        masks = hard_mask(self.mask_logits, MASK_THRESHOLD, 1.0 if weights is None else weights)
         return masks if rows is None else masks[rows]
 
     @torch.no_grad()
@@ -242,7 +241,7 @@ class CodedAnchors(AnchorModel):
         if self.phase == ENTROPY:
             steps = self.rate_model.forecast(self.context_of(rows), rows[:0]).steps
         groups = zip(self.raw(rows), steps.split(1, dim=1), self.centres(), strict=True)
-        features, scales, offsets = (self._round.forward(v, step, mean=centre) for v, step, centre in groups)
+        features, scales, offsets = (nearest_index(v, step, centre) * step for v, step, centre in groups)
         offsets = offsets.reshape(-1, self.num_offsets, 3)
         positions = self.positions().index_select(0, rows)
         return AnchorAttributes(positions, features, offsets, scales, self.masks(rows).detach())

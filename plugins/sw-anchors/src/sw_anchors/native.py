@@ -34,6 +34,5 @@ ANCHORS = NativeModule(
         "kernels/cuda/mixture.cu",
     ),
     cflags=("-fno-math-errno", "-fno-trapping-math"),  # without these GCC keeps sqrt and division out of vector code
-    seconds=20,
     without="anchors are decoded by torch operations: the same numbers, slower",
 )

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from sw_anchors.shape import AnchorShape
-from sw_codecs.quantizers.binary import SteMask
-from sw_codecs.quantizers.rounding import add_noise
+from sw_codecs.quantizers.multiples import add_noise
+from sw_codecs.quantizers.straight_through import hard_mask
 
 FULL, QUANTIZED, ENTROPY = "full precision", "quantized training", "entropy training"
 """Training phases: raw values; noise with fixed steps; noise with predicted steps, and a rate loss."""
@@ -62,7 +62,7 @@ def noisy_values(
     if noise is not None:
         values = add_noise(values, shape.widened(noise.steps), noise.uniform)
     own, scales, shifts = values.split(list(shape.widths), dim=1)
-    masks = SteMask(threshold)(logits, 1.0 if mask_weights is None else mask_weights[rows].detach())
+    masks = hard_mask(logits, threshold, 1.0 if mask_weights is None else mask_weights[rows].detach())
     return NoisyValues(own, scales, shifts.reshape(-1, shape.offsets, 3), masks, values.index_select(0, drawn))
 
 

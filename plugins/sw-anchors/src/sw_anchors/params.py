@@ -12,7 +12,7 @@ from splatwizard_core.api import OptimizationParams, Params
 
 RANDOM_START: Mapping[str, Any] = {
     "init_points": 100_000,
-    "paired_offsets": True,
+    "visible_offsets": 5,
     "random_background_until": 1_500,
     "lr.mlp_opacity_early": 0.1,
 }
@@ -97,11 +97,11 @@ class AnchorParams(OptimizationParams):
     num_offsets: int = Field(10, ge=1, le=64, description="Gaussians per anchor")
     feature_dim: int = Field(50, ge=1, le=256, description="numbers in an anchor's feature")
     hidden: int = Field(50, ge=1, le=256, description="width of the networks that decode Gaussians")
-    paired_offsets: bool = Field(
-        False,
-        description="start the opacity network with weights of opposite sign for the second half of the offsets: "
-        "half of them are visible whatever the seed; false: random ones as published, 1 to 9 of 10, the same for all "
-        "anchors",
+    visible_offsets: int = Field(
+        0,
+        ge=0,
+        description="Gaussians per anchor that the first opacity network shows, at most half of them; 0: as its random "
+        "weights have it, as published: 1 to 9 of 10 by seed, the same for all anchors",
     )
     random_background_until: int = Field(
         0,

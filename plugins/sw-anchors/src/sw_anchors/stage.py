@@ -8,7 +8,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+import torch
 from sw_gaussians.learning_rate import exponential_lr
+from sw_gaussians.pictures import PictureSizes, Rounds
 
 from splatwizard_core.api import (
     LossPack,
@@ -30,7 +32,6 @@ from sw_anchors.growth import accumulate_anchor_statistics, adjust_anchors
 from sw_anchors.params import AnchorParams, CodedAnchorParams
 
 if TYPE_CHECKING:
-    import torch
     from torch import Tensor
 
     from splatwizard_core.api import (
@@ -58,9 +59,11 @@ class AnchorStage(Stage):
     opt: AnchorParams
     trains: type[AnchorModel] = AnchorModel
 
-    def __init__(self, opt: AnchorParams) -> None:
+    def __init__(self, opt: AnchorParams, *, pictures: PictureSizes | None = None) -> None:
+        """Set up for `opt`; pictures: `opt.pictures.load(plugins)`, None where their sizes do not change."""
         super().__init__(opt)
-        opt.pictures.check(opt)
+        opt.pictures.check(opt, pictures)
+        self.pictures = pictures
         self.extent = 1.0  # known when the stage begins; a plan can be printed without a scene
 
     def at(self, step: int) -> int:
@@ -75,21 +78,16 @@ class AnchorStage(Stage):
             raise TypeError(f"stage '{self.name}' trains a {self.trains.__name__}, not a {type(model).__name__}")
         self.growth_draws = context.generator("growth")
         self.extent = context.scene.extent
-        if self.opt.paired_offsets:
-            model.pair_offsets()
+        if self.opt.visible_offsets:
+            model.show_offsets(self.opt.visible_offsets, torch.stack([v.camera.center for v in context.scene.train]))
         return model
 
     # Optimizer
 
     def create_sampler(self, scene: Scene, generator: torch.Generator) -> CameraSampler:
-        return self.opt.pictures.sampler(
-            super().create_sampler(scene, generator),
-            scene,
-            self,
-            growth=[step for steps in self.adjustments for step in steps],
-            growth_stop=self.opt.growth.stop,
-            every=self.opt.growth.interval,
-        )
+        inner, growth = super().create_sampler(scene, generator), self.opt.growth
+        rounds = Rounds([step for steps in self.adjustments for step in steps], growth.stop, growth.interval)
+        return self.opt.pictures.sampler(self.pictures, inner, scene, self, rounds)
 
     def decay(self, step: int, init: float, final: float, *, max_steps: int | None = None) -> float:
         """Decay exponentially from `init` at step 0 to `final` at `max_steps` of the full run (None: lr.max_steps)."""

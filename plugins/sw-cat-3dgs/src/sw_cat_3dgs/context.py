@@ -25,7 +25,7 @@ from sw_cat_3dgs.principal_frame import PrincipalFrame
 from sw_cat_3dgs.spatial_ar import ExactSpatialAr, SpatialAr
 from sw_cat_3dgs.triplane import GAIN, Triplane
 from sw_codecs.context.two_layers import two_layers
-from sw_codecs.quantizers.rounding import add_noise
+from sw_codecs.quantizers.multiples import add_noise
 
 STEP_OFFSET = 1.1
 """A quantiser step is its base times (STEP_OFFSET + tanh t), t a step logit: 0.1 to 2.1 of the base, never zero."""

@@ -69,7 +69,7 @@ class Cat3DGS(Method):
         )  # fmt: skip
 
     def stages(self) -> Sequence[Stage]:
-        return [CatStage(self.config)]
+        return [CatStage(self.config, pictures=self.config.pictures.load(self.plugins))]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         if not isinstance(model, CatAnchors):

@@ -18,7 +18,8 @@ from splatwizard_core.api import BitstreamError
 from sw_codecs.context.integer_mlp import FRACTION, IntegerMlp
 from sw_codecs.context.two_layers import UnsetLinear
 from sw_codecs.entropy.exact_tables import LEVELS
-from sw_codecs.entropy.rates import laplace_bits, lower_bound
+from sw_codecs.entropy.further_rates import laplace_bits
+from sw_codecs.entropy.rates import lower_bound
 
 NEIGHBORS = (*((-2, right) for right in range(-2, 3)), *((-1, right) for right in range(-2, 3)), (0, -2), (0, -1))
 """(rows down, columns right) of the neighbours, in raster order."""

@@ -25,7 +25,6 @@ EXACT = NativeModule(
     ),
     headers=("exact_kernels/*.h",),
     cflags=("-fno-math-errno", "-fno-trapping-math"),  # without these GCC keeps conversions out of vector code
-    seconds=15,
     without="files of anchors decode by torch and the library constriction: the same bits, five to ten times slower",
 )
 

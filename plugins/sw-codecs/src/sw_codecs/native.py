@@ -29,7 +29,6 @@ CODECS = NativeModule(
     ),
     # A place is rounded as torch rounds it; no trap of a comparison keeps loops out of vector code.
     cflags=("-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"),
-    seconds=20,
     without="hash grids and planes are looked up by torch operations, Huffman codes decoded by a loop, codebooks "
     "searched whole: slower",
 )

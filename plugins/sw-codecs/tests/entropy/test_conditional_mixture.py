@@ -14,7 +14,7 @@ from splatwizard_core.errors import BitstreamError
 from sw_codecs.entropy import conditional_mixture
 from sw_codecs.entropy.conditional import ConditionalGaussian
 from sw_codecs.entropy.conditional_mixture import WIDTHS, ConditionalMixture
-from sw_codecs.entropy.rates import mixture_bits
+from sw_codecs.entropy.further_rates import mixture_bits
 
 C = ConditionalMixture
 

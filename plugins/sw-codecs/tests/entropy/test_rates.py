@@ -7,14 +7,14 @@ import pytest
 import torch
 from scipy import stats
 
-from sw_codecs.entropy import rates
+from sw_codecs.entropy import further_rates, rates
 
 
 def f64(*values):
     return torch.tensor(values, dtype=torch.float64)
 
 
-CASES = [(rates.gaussian_bits, stats.norm), (rates.laplace_bits, stats.laplace)]
+CASES = [(rates.gaussian_bits, stats.norm), (further_rates.laplace_bits, stats.laplace)]
 
 
 @pytest.mark.parametrize(("bits", "family"), CASES)
@@ -80,11 +80,11 @@ def test_an_outlier_is_pulled_towards_the_mean():
 
 
 def test_bernoulli_and_categorical_by_hand():
-    assert rates.bernoulli_bits(f64(1, 0), 0.25).tolist() == pytest.approx([2, -math.log2(0.75)], rel=1e-12)
-    assert float(rates.bernoulli_bits(f64(1), 0.0)) == pytest.approx(-math.log2(1e-6), rel=1e-12)
-    assert torch.isfinite(rates.bernoulli_bits(torch.ones(1, dtype=torch.float16), 1.0)).all()
+    assert further_rates.bernoulli_bits(f64(1, 0), 0.25).tolist() == pytest.approx([2, -math.log2(0.75)], rel=1e-12)
+    assert float(further_rates.bernoulli_bits(f64(1), 0.0)) == pytest.approx(-math.log2(1e-6), rel=1e-12)
+    assert torch.isfinite(further_rates.bernoulli_bits(torch.ones(1, dtype=torch.float16), 1.0)).all()
     logits = torch.log(f64(0.5, 0.25, 0.25)).expand(3, 3)
-    assert rates.categorical_bits(torch.arange(3), logits).tolist() == pytest.approx([1, 2, 2])
+    assert further_rates.categorical_bits(torch.arange(3), logits).tolist() == pytest.approx([1, 2, 2])
 
 
 def test_mask_bits_count_ones_and_the_stored_share():
@@ -116,7 +116,7 @@ def test_the_gradient_of_gaussian_bits_is_that_of_its_parts(grad_below_bound):
 def test_a_mixture_sums_to_one_and_is_that_of_scipy():
     logits, mean, scale = f64(0.5, 0.0, -2.0), f64(-4.0, 1.5, 0.0), f64(0.4, 1.0, 9.0)
     k = np.arange(-4000, 4001)
-    p = 2 ** -rates.mixture_bits(torch.from_numpy(k * 0.25), logits, mean, scale, 0.25, p_min=1e-300)
+    p = 2 ** -further_rates.mixture_bits(torch.from_numpy(k * 0.25), logits, mean, scale, 0.25, p_min=1e-300)
     assert float(p.sum()) == pytest.approx(1, abs=1e-6)
     near = np.abs(k) < 40
     expected = sum(
@@ -128,9 +128,9 @@ def test_a_mixture_sums_to_one_and_is_that_of_scipy():
 
 def test_a_mixture_of_one_is_its_component_and_trains():
     x = torch.linspace(-6, 6, 31, dtype=torch.float64)
-    one = rates.mixture_bits(x, f64(0.3), f64(0.5), f64(2.0), 0.5)
+    one = further_rates.mixture_bits(x, f64(0.3), f64(0.5), f64(2.0), 0.5)
     torch.testing.assert_close(one, rates.gaussian_bits(x, 0.5, 2.0, 0.5))
     arguments = [a.requires_grad_() for a in (x[:4].clone(), f64(0.1, 0.4), f64(0.5, -1.0), f64(2.0, 0.7))]
-    assert torch.autograd.gradcheck(lambda *a: rates.mixture_bits(*a, 0.5), arguments)
-    far = rates.mixture_bits(f64(40.0), f64(0.0, 0.0), f64(0.0, 0.0), f64(1.0, 1.0))
+    assert torch.autograd.gradcheck(lambda *a: further_rates.mixture_bits(*a, 0.5), arguments)
+    far = further_rates.mixture_bits(f64(40.0), f64(0.0, 0.0), f64(0.0, 0.0), f64(1.0, 1.0))
     assert far.item() == pytest.approx(24)

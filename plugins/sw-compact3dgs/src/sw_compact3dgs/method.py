@@ -68,7 +68,9 @@ class Compact3DGS(Method):
             raise ConfigError(
                 f"no entropy coder is called '{coder}'; installed: {', '.join(known)}", key="codec.settings.coder"
             )
-        return [Compact3DGSStage(self.config, self.config.density.load(self.plugins))]
+        config: Compact3DGSConfig = self.config
+        control, pictures = config.density.load(self.plugins), config.pictures.load(self.plugins)
+        return [Compact3DGSStage(config, control, pictures=pictures)]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         if not isinstance(model, CompactGaussians):

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 
+from sw_gaussians.pictures import PictureSizes
 from sw_gaussians.stage import ThreeDGSStage
 from sw_gaussians.volume_mask import VolumeMaskedGaussians, mask_prune, prune_by_mask
 from torch import Tensor
@@ -34,8 +35,10 @@ class Compact3DGSStage(ThreeDGSStage):
 
     name = "compact3dgs"
 
-    def __init__(self, opt: Compact3DGSConfig, control: DensityControl | None = None) -> None:
-        super().__init__(opt.base, control)
+    def __init__(
+        self, opt: Compact3DGSConfig, control: DensityControl | None = None, *, pictures: PictureSizes | None = None
+    ) -> None:
+        super().__init__(opt.base, control, pictures=pictures)
         self.opt = opt
         self.own = opt
 

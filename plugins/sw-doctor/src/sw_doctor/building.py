@@ -46,6 +46,8 @@ def build_all(
 ) -> list[BuildRow]:
     """Build the native modules that `targets` ("module:attribute") name; one row each, in their order.
 
+    One that has CUDA operations in a library of their own is followed by it, where that can be built.
+
     march, force    as for `NativeModule.build`
     cuda            fail where a module's CUDA kernels cannot be built, instead of building what is left
     into_packages   put the libraries beside their packages' sources instead of into the user's cache
@@ -55,10 +57,17 @@ def build_all(
     """
     tools = Toolchain(jobs)
 
-    def build(target: str) -> BuildRow:
-        started = time.monotonic()
+    def build(target: str) -> list[BuildRow]:
         try:
             module = resolve_module(target)
+        except NativeBuildError as error:
+            return [BuildRow(target, "failed", 0.0, None, str(error))]
+        with_cuda = module.cuda is not None and (cuda or toolkit_mismatch() is None)
+        return [build_one(target, each) for each in (module, module.cuda if with_cuda else None) if each is not None]
+
+    def build_one(target: str, module: NativeModule) -> BuildRow:
+        started = time.monotonic()
+        try:
             missing = toolkit_mismatch() if cuda and module.cuda_sources else None
             if missing is not None:
                 raise NativeBuildError(f"the CUDA kernels of '{module.name}' cannot be built: {missing}")
@@ -71,7 +80,7 @@ def build_all(
 
     with ThreadPoolExecutor(max_workers=max(1, len(targets))) as pool:
         try:
-            return list(pool.map(build, targets))
+            return [row for rows in pool.map(build, targets) for row in rows]
         except BaseException:  # asked to end: the threads of the pool wait for compilers
             tools.stop()
             raise

@@ -171,10 +171,8 @@ def check_kernels(target: str) -> Check:
     if facts["state"] == "damaged":
         detail = "the build in the cache is damaged"
         return Check("kernels", module.name, "broken", detail, f"{build} --force", facts=facts)
-    expected = module.expected_seconds()
-    about = "" if expected is None else f" (about {expected:.0f} s, by earlier builds)"
-    detail = f"not built; compiled when first used{about}"
-    return Check("kernels", module.name, "missing", f"{detail}. Without: {module.without}", build, facts=facts)
+    detail = f"not built; compiled when first used. Without: {module.without}"
+    return Check("kernels", module.name, "missing", detail, build, facts=facts)
 
 
 def check_entries(plugins: PluginManager) -> list[Check]:

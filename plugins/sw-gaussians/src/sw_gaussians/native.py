@@ -12,6 +12,5 @@ GAUSSIANS = NativeModule(
     headers=("kernels/*.h", "kernels/cuda/*.h"),
     cuda_sources=("kernels/cuda/statistics.cu", "kernels/cuda/sparse_adam.cu", "kernels/cuda/disagreement.cu"),
     cflags=("-fno-math-errno", "-fno-trapping-math"),  # without these GCC keeps sqrt and division out of vector code
-    seconds=10,
     without="sparse Adam, gradient statistics and normal losses run on torch operations: the same numbers, slower",
 )

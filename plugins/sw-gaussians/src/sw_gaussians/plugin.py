@@ -55,6 +55,9 @@ def register_tasks(registry: Registry) -> None:
                  factory=True)  # fmt: skip
     registry.add("average-parameters", "sw_gaussians.averaging:AverageParameters",
                  summary="make a model the mean of itself over the last steps", factory=True)  # fmt: skip
+    registry.add("dash", "sw_gaussians.resolution:SmallPictures",
+                 summary="begin with small pictures, sizes by what their spectra hold (DashGaussian)",
+                 factory=True, resizes_pictures=True)  # fmt: skip
     registry.add("settle-learning-rates", "sw_gaussians.learning_rate_decay:SettleLearningRates",
                  summary="let learning rates fall towards the end", factory=True)  # fmt: skip
 

@@ -17,9 +17,7 @@ from splatwizard_core.api import (
     SceneError,
     SplatModel,
     leave_out_senseless,
-    origin_of,
     replacing,
-    world_shift,
 )
 from sw_gaussians.memory_map import memory_map
 from sw_gaussians.ply_gaussians import MIP_COMMENT, ORIGIN_COMMENT, WORLD_COMMENT, file_parts, parse_gaussians
@@ -82,8 +80,8 @@ def export_ply(model: SplatModel, path: str | os.PathLike[str]) -> None:
     for what in lost_options(model):
         log.warning("%s: not kept: %s", Path(path).name, what)
     comments = [MIP_COMMENT] if antialias_of(model) else []
-    shift = world_shift(model)
-    if (origin := origin_of(model)) is not None and any(origin):
+    shift = model.world_shift
+    if (origin := model.world_origin) is not None and any(origin):
         word = ORIGIN_COMMENT if shift is None else WORLD_COMMENT
         comments.append(f"{word} {' '.join(map(repr, origin))}")
     with replacing(path) as temporary, open(temporary, "wb") as file:

@@ -9,15 +9,12 @@ import bisect
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from splatwizard_core.api import CameraSampler, View
-
-if TYPE_CHECKING:
-    from splatwizard_core.api import Scene
+from splatwizard_core.api import CameraSampler, Scene, TrainingState, View
 
 LEVELS = 32
 """Number of resolution levels between the first and the full resolution."""
@@ -157,7 +154,7 @@ class ResolutionSampler(CameraSampler):
     inner       draws
     make_plan   () -> ResolutionPlan, asked at the first step: it reads all pictures, which is training time
     rounds      steps, ascending, after each of which the scale is read anew: those at which statistics start again, so
-                that all in between are of one resolution
+                that all in between are of one resolution; None: at every step
     rounding    "real": any scale; "floor": whole ones, as published
     """
 
@@ -166,7 +163,7 @@ class ResolutionSampler(CameraSampler):
         inner: CameraSampler,
         make_plan: Callable[[], ResolutionPlan],
         *,
-        rounds: Sequence[int],
+        rounds: Sequence[int] | None,
         rounding: Rounding = "real",
     ) -> None:
         self.inner, self.rounds, self.rounding = inner, rounds, rounding
@@ -185,8 +182,11 @@ class ResolutionSampler(CameraSampler):
 
     def scale(self, step: int) -> float:
         """Return how many times smaller the pictures of a step are."""
-        past = bisect.bisect_left(self.rounds, step)  # a round at step k is past from step k + 1 on
-        scale = 1.0 if step > self.plan.times[-1] else self.plan.scale(self.rounds[past - 1] if past else 0)
+        read_at = step
+        if self.rounds is not None:
+            past = bisect.bisect_left(self.rounds, step)  # a round at step k is past from step k + 1 on
+            read_at = self.rounds[past - 1] if past else 0
+        scale = 1.0 if step > self.plan.times[-1] else self.plan.scale(read_at)
         return float(math.floor(scale)) if self.rounding == "floor" else scale
 
     def next(self, step: int) -> View:
@@ -211,24 +211,30 @@ class ResolutionSampler(CameraSampler):
         self.inner.load_state_dict(state)
 
 
-def by_resolution(
-    inner: CameraSampler,
-    scene: Scene,
-    *,
-    full_at: int,
-    rounds: Sequence[int],
-    most: float = 4.0,
-    rounding: Rounding = "real",
-) -> ResolutionSampler:
-    """Return a sampler that hands out what `inner` draws by the resolution schedule of a scene.
+class SmallPictures:
+    """Schedule task "dash": a training draws its views by the resolution schedule of its scene, from small to whole.
+
+    As a task it runs before rendering, from the first step to `full_at`. Checkpoints hold the same with it as without.
 
     full_at     step from which pictures are whole
-    rounds      steps, ascending, after which the schedule is looked at again: those that densify
+    rounds      steps, ascending, after which sizes may change: those that densify; None: all
     most        times that the first pictures are smaller, at most
+    rounding    "real": any scale; "floor": whole ones, as published
     """
-    return ResolutionSampler(
-        inner,
-        lambda: plan_of_views(scene.train, full_at=full_at, most=most, background=scene.background),
-        rounds=rounds,
-        rounding=rounding,
-    )
+
+    def __init__(
+        self, *, full_at: int, rounds: list[int] | None = None, most: float = 4.0, rounding: Rounding = "real"
+    ) -> None:
+        self.full_at, self.rounds, self.most, self.rounding = full_at, rounds, most, rounding
+
+    def __call__(self, state: TrainingState) -> None:
+        if not isinstance(state.sampler, ResolutionSampler):
+            state.sampler = self.sampler(state.sampler, state.scene)
+
+    def sampler(self, inner: CameraSampler, scene: Scene) -> ResolutionSampler:
+        """Return a sampler that hands out what `inner` draws in the sizes of the schedule."""
+
+        def plan() -> ResolutionPlan:
+            return plan_of_views(scene.train, full_at=self.full_at, most=self.most, background=scene.background)
+
+        return ResolutionSampler(inner, plan, rounds=self.rounds, rounding=self.rounding)

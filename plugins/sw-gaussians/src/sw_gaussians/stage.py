@@ -23,6 +23,7 @@ from sw_gaussians.control_tasks import control_task
 from sw_gaussians.fast.fused_adam import FusingOptimizer, offer_updates
 from sw_gaussians.late_batches import LAST_PRIORITY, SumViews
 from sw_gaussians.learning_rate import exponential_lr
+from sw_gaussians.pictures import PictureSizes, Rounds
 from sw_gaussians.sparse_adam import SparseSplatOptimizer
 
 if TYPE_CHECKING:
@@ -85,6 +86,7 @@ class ThreeDGSStage(Stage):
     """Adam on six parameter groups, L1 + SSIM, and a density control.
 
     control         what adds and removes Gaussians: `config.density.load(plugins)`; None: adaptive density control
+    pictures        what changes sizes of pictures: `config.pictures.load(plugins)`; None: nothing
     fuses_updates   on CUDA spherical harmonics are updated in the backward pass, at steps at which nothing else asks
                     for their gradients; with dense Adam alone. None: from `fused_adam.MIN_FUSED_GAUSSIANS` Gaussians on
     """
@@ -92,14 +94,20 @@ class ThreeDGSStage(Stage):
     name = "3dgs"
 
     def __init__(
-        self, opt: GaussianTraining, control: DensityControl | None = None, *, fuses_updates: bool | None = False
+        self,
+        opt: GaussianTraining,
+        control: DensityControl | None = None,
+        *,
+        pictures: PictureSizes | None = None,
+        fuses_updates: bool | None = False,
     ) -> None:
         super().__init__(opt)
         self.config = opt
         self.control = opt.density.usual() if control is None else control
         self.control.when = self.when
         self.fuses_updates = fuses_updates
-        opt.pictures.check(opt)
+        opt.pictures.check(opt, pictures)
+        self.pictures = pictures
         if opt.sparse_adam:
             for key, is_on in (
                 ("fused_updates=true", fuses_updates),
@@ -152,14 +160,9 @@ class ThreeDGSStage(Stage):
         return model
 
     def create_sampler(self, scene: Scene, generator: torch.Generator) -> CameraSampler:
-        return self.config.pictures.sampler(
-            super().create_sampler(scene, generator),
-            scene,
-            self,
-            growth=self.densifications,
-            growth_stop=self.control.until,
-            every=self.control.rounds.step,
-        )
+        inner = super().create_sampler(scene, generator)
+        rounds = Rounds(self.densifications, self.control.until, self.control.rounds.step)
+        return self.config.pictures.sampler(self.pictures, inner, scene, self, rounds)
 
     def create_optimizer(self, model: SplatModel, scene: Scene) -> SplatOptimizer:
         lr = self.config.lr

@@ -8,14 +8,14 @@ At the last step of a stage the two tasks that disturb a picture (densification,
 """
 
 from splatwizard_core.api import GaussianModel, OptimizationParams, Scene, SplatOptimizer, TaskLog
-from sw_gaussians import density
+from sw_gaussians.density import adc
 from sw_gaussians.stage import UpdateLearningRate, increase_sh_degree
 
 __all__ = ["PruneAndDensify", "ResetOpacity", "UpdateLearningRate", "increase_sh_degree"]
 
 
 class PruneAndDensify:
-    """Clones, splits and prunes (sw_gaussians.density.densify_and_prune).
+    """Clones, splits and prunes (sw_gaussians.density.adc.densify_and_prune).
 
     size_rules_after    steps before which nothing is pruned for its size: the first reset interval
     The other settings are those of `densify_and_prune`. Curves: "cloned", "split", "pruned", numbers of Gaussians.
@@ -53,7 +53,7 @@ class PruneAndDensify:
     ) -> None:
         if step >= opt.iterations:
             return
-        report = density.densify_and_prune(model, optimizer, step=step, extent=scene.extent, **self.settings)
+        report = adc.densify_and_prune(model, optimizer, step=step, extent=scene.extent, **self.settings)
         for name, count in report.items():
             log.scalar(name, count)
 
@@ -66,4 +66,4 @@ class ResetOpacity:
 
     def __call__(self, model: GaussianModel, optimizer: SplatOptimizer, opt: OptimizationParams, step: int) -> None:
         if step < opt.iterations:
-            density.reset_opacity(model, optimizer, ceiling=self.ceiling)
+            adc.reset_opacity(model, optimizer, ceiling=self.ceiling)

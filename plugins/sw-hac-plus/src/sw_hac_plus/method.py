@@ -67,7 +67,7 @@ class HACPlus(Method):
         )  # fmt: skip
 
     def stages(self) -> Sequence[Stage]:
-        return [HACPlusStage(self.config)]
+        return [HACPlusStage(self.config, pictures=self.config.pictures.load(self.plugins))]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         if not isinstance(model, HACPlusAnchors):

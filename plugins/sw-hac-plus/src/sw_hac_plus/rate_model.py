@@ -16,7 +16,7 @@ from sw_anchors.rate_model import AnchorForecast, floored
 from sw_anchors.row_parts import MAX_EXACT_NUMBERS, MAX_FLOAT_NUMBERS, by_parts
 from torch import Tensor
 
-from sw_codecs.entropy import rates
+from sw_codecs.entropy import further_rates, rates
 from sw_codecs.entropy.rows import RowMixture
 from sw_hac.rate_model import BlockPrediction, HACRateModel, float_outputs, float_prediction
 from sw_hac.rate_model import Predictor as GridPredictor
@@ -71,7 +71,7 @@ class HACPlusRateModel(HACRateModel):
         logit = forecast.outputs[:, sum(self.shape.outputs) :]
         context = torch.cat([found.means[0] / base, found.scales[0] / base, logit], dim=1)
         second_mean, second_scale, second_logit = self.channel(values[:, :f] / base, context)
-        features = rates.mixture_bits(
+        features = further_rates.mixture_bits(
             values[:, :f],
             torch.stack([logit, second_logit], dim=-1),
             torch.stack([mean[:, :f], base * second_mean], dim=-1),

@@ -37,7 +37,7 @@ class HAC(Method):
         return HACAnchors.of_scene(scene, self.config, generator)
 
     def stages(self) -> Sequence[Stage]:
-        return [HACStage(self.config)]
+        return [HACStage(self.config, pictures=self.config.pictures.load(self.plugins))]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         if not isinstance(model, HACAnchors):

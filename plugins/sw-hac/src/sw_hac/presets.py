@@ -49,12 +49,15 @@ A tenth of the steps takes larger updates, a prediction that starts where the va
 twentieth; networks and grids of the published size would be most of so small a file.
 """
 
+_RATE_START: Mapping[str, Any] = {"rate_term.start": "statistics", "rate_term.scale_floor": 0.05}
+"""A rate that every number learns: as published, one whose deviation starts negative stays at 20 bits for good."""
+
 BY_DATASET: Mapping[str, Mapping[str, Any]] = {
     "tandt": {"voxel_size": 0.01},
     "db": {"voxel_size": 0.005},
     "bungee": {"voxel_size": 0.0, "growth.init_factor": 128},
-    "nerf_synthetic": {"growth.init_factor": 4, "background": "black", **RANDOM_START},
-    "blender": RANDOM_START,
+    "nerf_synthetic": {"growth.init_factor": 4, "background": "black", **RANDOM_START, **_RATE_START},
+    "blender": {**RANDOM_START, **_RATE_START},
 }
 """Values that the authors of HAC and HAC++ set by data set, keys of the scene included; the rest is Mip-NeRF 360's.
 

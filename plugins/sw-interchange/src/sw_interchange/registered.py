@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from sw_gaussians.render_options import lost_options
 
-from splatwizard_core.api import GaussianModel, LeftOut, SceneError, SplatModel, origin_of, world_shift
+from splatwizard_core.api import GaussianModel, LeftOut, SceneError, SplatModel
 from sw_interchange.bridge import from_gaussians, to_gaussians
 from sw_interchange.files import read, write
 from sw_interchange.scene import ReadReport, WriteReport
@@ -47,7 +47,7 @@ def _exporter(name: str, **options: Any) -> Callable[[SplatModel, Path], None]:
                 path=str(path),
             )
         found, told = from_gaussians(model), os.path.basename(path)
-        origin, shift = origin_of(model), world_shift(model)
+        origin, shift = model.world_origin, model.world_shift
         if shift is not None:
             found = replace(found, means=(found.means.astype(np.float64) + np.array(shift)).astype(np.float32))
             step = np.spacing(np.float32(np.abs(shift).max()))

@@ -55,7 +55,6 @@ MODULE = NativeModule(
     # Neither changes a result: no caller reads errno, no one traps floating-point exceptions. Without them square
     # roots and selections stay scalar. Nothing of -ffast-math is needed, the packs are vectors as written.
     cflags=("-fno-math-errno", "-fno-trapping-math"),
-    seconds=20,
     without="rendering falls back to the pure-torch reference, some hundred times slower",
 )
 

@@ -9,9 +9,9 @@ import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from splatwizard_core.api import ForeseenError, Scene
+from splatwizard_core.api import Scene
 from splatwizard_core.tooling import FILE_NAME as RECORD
-from splatwizard_core.tooling import FinishedRuns, write_atomic
+from splatwizard_core.tooling import FinishedRuns, ForeseenError, write_atomic
 from sw_report.facts import read_facts
 from sw_report.page import FILE_NAME, write_page
 from sw_report.rd_file import FILE_NAME as PLOT_NAME

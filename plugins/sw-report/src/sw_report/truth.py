@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from splatwizard_core.api import ForeseenError
+from splatwizard_core.tooling import ForeseenError
 from sw_report.facts import RunFacts, clean
 from sw_report.runs import Run
 

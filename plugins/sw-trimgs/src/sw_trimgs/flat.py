@@ -9,7 +9,7 @@ import math
 from typing import TYPE_CHECKING
 
 import torch
-from sw_gaussians.density import rotate
+from sw_gaussians.density.splitting import rotate
 from sw_gaussians.surfels import SURFEL_THICKNESS, as_ellipsoids
 
 from splatwizard_core.api import GaussianInputs, GaussianModel

@@ -46,7 +46,9 @@ class Flat3DGS(GaussianMethod):
         return FlatGaussians(*tensors, active_sh_degree=0)
 
     def stages(self) -> Sequence[Stage]:
-        return [FlatStage(self.config, self.config.density.load(self.plugins))]
+        config: FlatConfig = self.config
+        control, pictures = config.density.load(self.plugins), config.pictures.load(self.plugins)
+        return [FlatStage(config, control, pictures=pictures)]
 
 
 class Trim3DGS(GaussianMethod):

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal
 
 import torch
-from sw_gaussians.density import split_children
+from sw_gaussians.density.splitting import split_children
 from sw_gaussians.statistics import GRADIENT_STATISTICS
 
 from splatwizard_core.api import (

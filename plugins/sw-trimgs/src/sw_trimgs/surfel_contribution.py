@@ -12,7 +12,7 @@ import math
 from typing import TYPE_CHECKING
 
 import torch
-from sw_gaussians.density import rotate
+from sw_gaussians.density.splitting import rotate
 
 from splatwizard_core.api import GaussianInputs, RasterOptions
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import torch
 from sw_gaussians.control_tasks import Change
-from sw_gaussians.density import AdaptiveDensityControl
+from sw_gaussians.density.adc import AdaptiveDensityControl
 from sw_gaussians.stage import ThreeDGSStage
 from sw_gaussians.surface import surface_depth
 from sw_gaussians.surface_losses import add_surface_losses, maps_for

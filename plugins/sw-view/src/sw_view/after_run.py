@@ -7,8 +7,8 @@ from pathlib import Path
 
 import torch
 
-from splatwizard_core.api import ForeseenError, GaussianModel
-from splatwizard_core.tooling import FinishedRun, load_plugins, open_model
+from splatwizard_core.api import GaussianModel
+from splatwizard_core.tooling import FinishedRun, ForeseenError, load_plugins, open_model
 from sw_view.page_file import FILE_NAME, About, write_page
 from sw_view.shown_cameras import surroundings_of
 

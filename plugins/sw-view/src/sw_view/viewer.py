@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from splatwizard_core.api import Camera, CapabilityError, ForeseenError
+from splatwizard_core.api import Camera, CapabilityError
+from splatwizard_core.tooling import ForeseenError
 from sw_view.exhibits import Exhibit
 from sw_view.frames import REST, Pixels, orientation_of, side_by_side
 from sw_view.shown_cameras import Surroundings

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -18,6 +18,22 @@ from splatwizard_native import activated
 
 if TYPE_CHECKING:
     from splatwizard_core.rendering.rasterizer import Rasterizer
+
+
+Origin = tuple[float, float, float]
+WORLD_ORIGIN = "world_origin"
+"""Key of a model's `origin`, and of a file's header: where the origin of its coordinates lies in the world."""
+AS_WORLD = "as_world"
+"""Key of a model's `origin`: whoever writes it next adds the world's origin to its coordinates."""
+
+
+def as_origin(value: Any) -> Origin | None:
+    """Three finite numbers of a file as an origin; None for anything else."""
+    numbers = isinstance(value, Sequence) and len(value) == 3 and all(type(x) in (int, float) for x in value)
+    if not numbers or not all(math.isfinite(x) for x in value):
+        return None
+    x, y, z = value
+    return (float(x), float(y), float(z))
 
 
 class GaussianModel(SplatModel):
@@ -97,6 +113,16 @@ class GaussianModel(SplatModel):
         given = {**dict(zip(cls.RAW, raw, strict=False)), **named}
         copies = {name: tensor.detach().clone().contiguous() for name, tensor in given.items()}
         return cls(**copies, active_sh_degree=active_sh_degree)
+
+    @property
+    def world_origin(self) -> Origin | None:
+        """Place (x, y, z) of the origin of the coordinates in the world, as the file says; None: it does not say."""
+        return as_origin(self.origin.get(WORLD_ORIGIN))
+
+    @property
+    def world_shift(self) -> Origin | None:
+        """Shift (x, y, z) that an exporter adds to the coordinates, if those of the world are asked for; else None."""
+        return self.world_origin if self.origin.get(AS_WORLD) else None
 
     @property
     def max_sh_degree(self) -> int:

@@ -3,41 +3,19 @@
 from __future__ import annotations
 
 import logging
-import math
-from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
 
 from splatwizard_core.errors import UserInputError
-from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.gaussians.model import AS_WORLD, WORLD_ORIGIN, GaussianModel, Origin
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.scene.scene import Scene
 
 log = logging.getLogger(__name__)
 
 AnyModel = TypeVar("AnyModel", bound=SplatModel)
-Origin = tuple[float, float, float]
 NOWHERE: Origin = (0.0, 0.0, 0.0)
-WORLD_ORIGIN = "world_origin"
-"""Key of a model's `origin`, and of a file's header: where the origin of its coordinates lies in the world."""
-
-AS_WORLD = "as_world"
-"""Key of a model's `origin`: whoever writes it next adds the world's origin to its coordinates."""
-
-
-def origin_of(model: SplatModel) -> Origin | None:
-    """Return where the origin of a model's coordinates lies in the world, as its file says; else None."""
-    return as_origin(getattr(model, "origin", {}).get(WORLD_ORIGIN))
-
-
-def as_origin(value: Any) -> Origin | None:
-    """Three finite numbers of a file as an origin; None for anything else."""
-    numbers = isinstance(value, Sequence) and len(value) == 3 and all(type(x) in (int, float) for x in value)
-    if not numbers or not all(math.isfinite(x) for x in value):
-        return None
-    x, y, z = value
-    return (float(x), float(y), float(z))
 
 
 def with_origin(model: SplatModel, origin: Origin) -> None:
@@ -57,7 +35,7 @@ def placed_in(model: AnyModel, scene: Scene, name: str = "the model") -> AnyMode
     if not isinstance(model, GaussianModel) or not model.num_rows:
         return model
     here = torch.tensor(scene.origin, dtype=torch.float64)
-    told = origin_of(model)
+    told = model.world_origin
     if told is not None:
         shift = torch.tensor(told, dtype=torch.float64) - here
     elif any(scene.origin):
@@ -86,7 +64,7 @@ def in_world(model: SplatModel, name: str) -> SplatModel:
             f"--world: {name} holds no explicit Gaussians (but {type(model).__name__}), whose Gaussians depend on the "
             "camera; `sw bake FILE OUT --scene SCENE` fits explicit ones, which keep the origin of the scene"
         )
-    if origin_of(model) is None:
+    if model.world_origin is None:
         raise UserInputError(
             f"--world: {name} does not say where its origin lies: its scene was not moved, or another program wrote it"
         )
@@ -94,6 +72,12 @@ def in_world(model: SplatModel, name: str) -> SplatModel:
     return model
 
 
+# Old names of the api, until 0.4.
+
+
+def origin_of(model: SplatModel) -> Origin | None:
+    return getattr(model, "world_origin", None)
+
+
 def world_shift(model: SplatModel) -> Origin | None:
-    """Return what an exporter adds to the coordinates: the world's origin, if world coordinates are asked for."""
-    return origin_of(model) if getattr(model, "origin", {}).get(AS_WORLD) else None
+    return getattr(model, "world_shift", None)

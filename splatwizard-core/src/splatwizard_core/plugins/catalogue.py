@@ -7,6 +7,7 @@ of another one.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib.metadata
 import json
@@ -32,13 +33,15 @@ def catalogue() -> Mapping[str, Mapping[str, str]]:
 def package_of(kind: str, name: str) -> str | None:
     """The distribution of ours that provides `name` and is not installed; None if there is none."""
     package = catalogue().get(kind, {}).get(name)
-    if package is None:
-        return None
-    try:
-        importlib.metadata.distribution(package)
-    except importlib.metadata.PackageNotFoundError:
-        return package
-    return None  # it is there, but broken or left out: that is another message
+    # One that is there, but broken or left out, is another message.
+    return package if package and not installed_version(package) else None
+
+
+def installed_version(distribution: str) -> str:
+    """The version of a distribution; "" for one that is not installed."""
+    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+        return importlib.metadata.version(distribution)
+    return ""
 
 
 def superseded() -> Mapping[str, str]:

@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlparse
 
-from splatwizard_core.plugins.catalogue import CORE, is_ours, normal_name
+from splatwizard_core.base.toml_file import read_toml
+from splatwizard_core.plugins.catalogue import CORE, installed_version, is_ours, normal_name
 
 if TYPE_CHECKING:
     from packaging.requirements import Requirement
@@ -93,7 +94,7 @@ def sources(specs: Iterable[Requirement], root: Path) -> tuple[list[str], list[R
         needs = project.get("dependencies", []) if "" in new else []
         needs = [*needs, *(line for extra in new for line in project.get("optional-dependencies", {}).get(extra, []))]
         for need in map(Requirement, needs):
-            if is_ours(need.name) and (need.extras or not _is_installed(need.name)):
+            if is_ours(need.name) and (need.extras or not installed_version(need.name)):
                 left.append(need)
     told = {_shown(Path(path)): ",".join(sorted(extras)) for path, extras in found.items()}
     return [path + (f"[{extras}]" if extras else "") for path, extras in told.items()], others
@@ -146,14 +147,6 @@ def _shown(path: Path) -> str:
         return str(path)
 
 
-def _is_installed(distribution: str) -> bool:
-    try:
-        importlib.metadata.distribution(distribution)
-    except importlib.metadata.PackageNotFoundError:
-        return False
-    return True
-
-
 def _is_newer(spec: Requirement, root: Path) -> bool:
     """Whether a checkout is older than what is asked for."""
     folder = folder_of(spec.name, root)
@@ -163,10 +156,5 @@ def _is_newer(spec: Requirement, root: Path) -> bool:
 
 
 def _project(folder: Path) -> dict[str, Any]:
-    if sys.version_info >= (3, 11):
-        import tomllib
-    else:
-        import tomli as tomllib
-
-    found: dict[str, Any] = tomllib.loads((folder / "pyproject.toml").read_text("utf-8"))["project"]
+    found: dict[str, Any] = read_toml(folder / "pyproject.toml", "project")[0]["project"]
     return found

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from packaging.requirements import Requirement
 
 from splatwizard_core.plugins import Entry, PluginManager
-from splatwizard_core.plugins.catalogue import CORE, is_ours, normal_name, superseded
+from splatwizard_core.plugins.catalogue import CORE, installed_version, is_ours, normal_name, superseded
 
 
 def made_by(plugins: PluginManager, entries: Iterable[Entry]) -> dict[str, str]:
@@ -21,7 +21,7 @@ def made_by(plugins: PluginManager, entries: Iterable[Entry]) -> dict[str, str]:
 def installed(plugins: PluginManager, distributions: Iterable[str]) -> dict[str, str]:
     """Map distribution to version as installed, the core's too; "" for one that is not there any more."""
     loaded = {plugin.distribution: plugin.version for plugin in plugins.plugins}
-    return {name: loaded.get(name) or _version(name) for name in sorted({CORE, *distributions} - {""})}
+    return {name: loaded.get(name) or installed_version(name) for name in sorted({CORE, *distributions} - {""})}
 
 
 def providers(plugins: PluginManager, *kinds: str) -> list[str]:
@@ -61,10 +61,3 @@ def _libraries(distribution: str) -> frozenset[str]:
                 found.add(name)
                 unseen.append(name)
     return frozenset(found)
-
-
-def _version(distribution: str) -> str:
-    try:
-        return importlib.metadata.version(distribution)
-    except importlib.metadata.PackageNotFoundError:
-        return ""

@@ -12,8 +12,8 @@ from splatwizard_core.coding.container import ContainerReader
 from splatwizard_core.errors import BitstreamError, PluginError, SplatwizardError, UserInputError
 from splatwizard_core.evaluation.speed import spread
 from splatwizard_core.gaussians.invalid_rows import leave_out_senseless
-from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.gaussians.placement import NOWHERE, as_origin, with_origin
+from splatwizard_core.gaussians.model import GaussianModel, as_origin
+from splatwizard_core.gaussians.placement import NOWHERE, with_origin
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.method import Method
 from splatwizard_core.plugins import PluginManager

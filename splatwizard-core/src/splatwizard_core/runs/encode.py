@@ -15,7 +15,8 @@ from splatwizard_core.coding.container import ContainerWriter
 from splatwizard_core.coding.requirements import Requirement
 from splatwizard_core.errors import SplatwizardError, UserInputError
 from splatwizard_core.evaluation.evaluate import kept_header
-from splatwizard_core.gaussians.placement import NOWHERE, Origin, origin_of
+from splatwizard_core.gaussians.model import Origin
+from splatwizard_core.gaussians.placement import NOWHERE
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.method import Method
 from splatwizard_core.plugins import Entry
@@ -125,7 +126,7 @@ def encode_ply(session: Session, resolved: ResolvedConfig, path: Path, target: P
     last = list(method.stages())[-1]
     raster = kept_header(model, last.raster_options(last.iterations, torch.zeros(3)), resolved.ppl.raster.options)
     try:
-        origin = origin_of(model) or NOWHERE
+        origin = getattr(model, "world_origin", None) or NOWHERE
         return encode(method, model, raster, target, origin, deterministic=resolved.ppl.deterministic)
     except (TypeError, AttributeError) as error:
         raise UserInputError(f"method '{method.name}' does not encode a .ply of explicit Gaussians: {error}") from error

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.optim.adam import adam
 
+from splatwizard_native.fused import face
 from splatwizard_native.fused.native import TRAINING
 
 
@@ -42,15 +44,37 @@ def adam_steps(updates: Sequence[AdamUpdate]) -> None:
         _check(u)
         by_kind.setdefault(u.param.device.type, []).append(u)
     for kind, together in by_kind.items():
-        kernels = TRAINING.has_cuda() if kind == "cuda" else kind == "cpu" and TRAINING.try_load()
-        for u in _by_kernel(together) if kernels else together:
+        if kind == "cuda" and TRAINING.has_cuda():
+            together = _on_cuda(together)
+        elif kind == "cpu" and TRAINING.try_load():
+            together = _on_cpu(together)
+        for u in together:
             _by_torch(u)
 
 
-def _by_kernel(updates: Sequence[AdamUpdate]) -> list[AdamUpdate]:
-    """Do these updates, all on the CPU or all on CUDA; return those that the kernels do not take."""
+def _on_cpu(updates: Sequence[AdamUpdate]) -> list[AdamUpdate]:
+    """Do these updates, all on the CPU; return those that the kernel does not take."""
+    rows, held, left = [], [], []
+    for u in updates:
+        tensors = u.param, u.grad.contiguous(), u.exp_avg, u.exp_avg_sq
+        for t in tensors:
+            if t.dtype is not torch.float32 or not t.is_cpu or not t.is_contiguous():
+                left.append(u)
+                break
+        else:
+            held.append(tensors)  # alive until the call
+            addresses = [t.data_ptr() for t in tensors]
+            rows.append((*addresses, u.param.numel(), u.lr, u.beta1, u.beta2, u.eps, u.step))
+    listed: Any = face.adam_update * len(rows)
+    face.adam(updates=listed(*rows), count=len(rows))
+    torch.autograd.graph.increment_version([tensors[0] for tensors in held])
+    return left
+
+
+def _on_cuda(updates: Sequence[AdamUpdate]) -> list[AdamUpdate]:
+    """Do these updates, all on CUDA; return those that the kernels do not take."""
     left = torch.ops.splatwizard_training.adam_many(
-        [u.param for u in updates], [u.grad if u.grad.is_cuda else u.grad.contiguous() for u in updates],
+        [u.param for u in updates], [u.grad for u in updates],
         [u.exp_avg for u in updates], [u.exp_avg_sq for u in updates],
         [u.lr for u in updates], [u.beta1 for u in updates], [u.beta2 for u in updates],
         [u.eps for u in updates], [u.step for u in updates],

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
+from splatwizard_native.fused import face
 from splatwizard_native.fused.native import TRAINING
 
 Padding = Literal["same", "valid"]
@@ -46,14 +47,16 @@ class _Photometric(torch.autograd.Function):
     def forward(
         ctx: Any, x: Tensor, y: Tensor, valid: bool, l1_weight: float, ssim_weight: float, offset: float
     ) -> tuple[Tensor, Tensor, Tensor]:
-        images = [t.reshape(-1, *t.shape[-2:]).contiguous() for t in (x, y)]
-        l1, similarity, grad = torch.ops.splatwizard_training.photometric(
-            *images, valid, l1_weight, ssim_weight, ctx.needs_input_grad[0]
-        )
-        ctx.save_for_backward(grad.view(x.shape) if ctx.needs_input_grad[0] else None)
-        parts = x.new_tensor(l1), x.new_tensor(similarity)
+        image, target = (t.reshape(-1, *t.shape[-2:]).contiguous() for t in (x, y))
+        grad = torch.empty_like(image) if ctx.needs_input_grad[0] else None
+        found = face.photometric(
+            x=image, y=target, valid=valid, l1_weight=l1_weight, ssim_weight=ssim_weight, grad=grad,
+            row_sums=image.new_empty(2, *image.shape[:2], dtype=torch.float64),
+        )  # fmt: skip
+        ctx.save_for_backward(None if grad is None else grad.view(x.shape))
+        parts = x.new_tensor(found.l1), x.new_tensor(found.ssim)
         ctx.mark_non_differentiable(*parts)
-        return x.new_tensor(offset + l1_weight * l1 + ssim_weight * similarity), *parts
+        return x.new_tensor(offset + l1_weight * found.l1 + ssim_weight * found.ssim), *parts
 
     @staticmethod
     @once_differentiable

@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 from splatwizard_native import fast_enabled
 from sw_anchors.native import ANCHORS
 from sw_anchors.shape import AnchorShape
-from sw_codecs.quantizers.binary import SteMask
+from sw_codecs.quantizers.straight_through import hard_mask
 
 MAX_TENSORS = 12
 """Largest number of tensors per launch: `kTensors` of kernels/rows.h."""
@@ -121,7 +121,7 @@ def noisy_rows(
         return values, (groups[0], groups[1], groups[2]), masks, kept
     shape = AnchorShape(features.shape[1], logits.shape[1])
     values = torch.cat([features, log_scales.exp(), offsets], dim=1)
-    masks = SteMask(threshold)(logits, 1.0 if mask_weights is None else mask_weights)
+    masks = hard_mask(logits, threshold, 1.0 if mask_weights is None else mask_weights)
     masks = masks * (torch.arange(len(logits), device=values.device) < valid).to(values)[:, None]
     if noise is not None and steps is not None:
         values = torch.addcmul(values, noise.view_as(values), shape.widened(steps))

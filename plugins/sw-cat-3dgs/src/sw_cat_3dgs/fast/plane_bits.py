@@ -126,7 +126,7 @@ class _PartBits:
         away = self.offset.abs()
         self.near, self.far = (away - 0.5).mul_(self.narrowing), (away + 0.5).mul_(self.narrowing)
         self.at_near, self.at_far = self.near.abs().neg_().exp_().mul_(0.5), (-self.far).exp_().mul_(0.5)
-        # As `rates.laplace_mass`.
+        # As `further_rates.laplace_mass`.
         self.p = torch.where(self.near >= 0, self.at_near, 1 - self.at_near).sub_(self.at_far)
         self.bits = -self.p.clamp_min(P_MIN).log2_().sum()
 

@@ -21,7 +21,7 @@ from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from splatwizard_native import fast_enabled
 from sw_codecs.context.fast import grid_lookup, integer_grid
-from sw_codecs.quantizers.binary import SteBinary
+from sw_codecs.quantizers.straight_through import signs
 
 PRIMES = (1, 2654435761, 805459861)
 INITIAL = 1e-4
@@ -158,7 +158,7 @@ class HashGrid(nn.Module):
 
     def values(self) -> Tensor:
         """[entries, features] what is looked up; signs have a straight-through gradient."""
-        return SteBinary()(self.table) if self.binary else self.table
+        return signs(self.table) if self.binary else self.table
 
     def forward(self, x: Tensor, values: Tensor | None = None) -> Tensor:
         """[n, width]. Differentiable for the table and for x.

@@ -10,7 +10,7 @@ from splatwizard_core.api import BitstreamError
 from sw_codecs.bits.packing import ByteReader, write_varint
 from sw_codecs.coders.arithmetic import RangeCoder
 from sw_codecs.coders.model_spec import Bernoulli as BernoulliSpec
-from sw_codecs.entropy.rates import bernoulli_bits
+from sw_codecs.entropy.further_rates import bernoulli_bits
 
 
 class Bernoulli:

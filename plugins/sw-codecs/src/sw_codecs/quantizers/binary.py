@@ -8,26 +8,14 @@ import torch
 from torch import Tensor
 
 from sw_codecs.quantizers.side_information import within
-from sw_codecs.quantizers.straight_through import straight_through
-
-
-class _BinaryThrough(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, x: Tensor) -> Tensor:
-        ctx.save_for_backward(x)
-        return torch.where(x >= 0, 1.0, -1.0).to(x.dtype)
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> Tensor:  # type: ignore[override]
-        (x,) = ctx.saved_tensors
-        return grad * (x.abs() <= 1)
+from sw_codecs.quantizers.straight_through import hard_mask, signs
 
 
 class SteBinary:
     """+1 where x >= 0, else -1; gradient 1 for |x| <= 1, else 0. Symbols are 1 and 0."""
 
     def forward(self, x: Tensor) -> Tensor:
-        return _BinaryThrough.apply(x)
+        return signs(x)
 
     __call__ = forward
 
@@ -51,8 +39,7 @@ class SteMask:
         self.threshold = threshold
 
     def forward(self, x: Tensor, weight: float | Tensor = 1.0) -> Tensor:
-        soft = torch.sigmoid(x) * weight
-        return straight_through(soft, soft > self.threshold)
+        return hard_mask(x, self.threshold, weight)
 
     __call__ = forward
 

@@ -1,7 +1,4 @@
-"""Quantizer `ste-round` with a step, and the noise that stands in for it. Round means half to even (torch.round).
-
-Noise and rounding never mix: training renders and rates the noisy value, everything else the rounded one.
-"""
+"""Quantizer `ste-round` with a step. Round means half to even (torch.round); `multiples` has its plain functions."""
 
 from __future__ import annotations
 
@@ -13,10 +10,9 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.api import BitstreamError
+from sw_codecs.quantizers.multiples import INDEX_CLAMP, INDEX_LIMIT, checked
+from sw_codecs.quantizers.multiples import add_noise as add_noise
 from sw_codecs.quantizers.side_information import finite_values, fits, within
-
-INDEX_CLAMP = 15_000  # index ranges then fit int16 (HAC)
-INDEX_LIMIT = 1 << 30
 
 
 class _RoundThrough(torch.autograd.Function):
@@ -103,9 +99,7 @@ class SteRound:
         low, high = self._limits(x, q, mean)
         if low is not None and high is not None:
             index = torch.clamp(index, low, high)
-        if x.numel() and not float(index.abs().max()) < INDEX_LIMIT:
-            raise ValueError("a quantizer index is beyond 2^30: the step is too small")
-        return index.to(torch.int64), {"step": q.detach().cpu().numpy().astype(np.float64)}
+        return checked(index), {"step": q.detach().cpu().numpy().astype(np.float64)}
 
     @staticmethod
     def decode(symbols: Tensor, side: dict[str, Any]) -> Tensor:
@@ -117,11 +111,3 @@ class SteRound:
             raise BitstreamError(f"quantizer steps {list(step.shape)} do not fit {list(symbols.shape)}")
         step64 = torch.as_tensor(step.astype(np.float64), device=symbols.device)
         return finite_values(within(symbols, -INDEX_LIMIT, INDEX_LIMIT).to(torch.float64) * step64)
-
-
-def add_noise(x: Tensor, step: Tensor, uniform: Tensor) -> Tensor:
-    """x + step * (u - 1/2), as one operator: rounding to multiples of `step` as it is seen in training; differentiable.
-
-    uniform     draws u ~ U(0,1) of the shape of x; they are overwritten
-    """
-    return torch.addcmul(x, uniform.sub_(0.5), step)

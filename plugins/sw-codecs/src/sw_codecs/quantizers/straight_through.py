@@ -25,3 +25,14 @@ def straight_through(x: Tensor, values: Tensor, inside: Tensor | None = None) ->
     x + (values - x).detach() would be the same but for the last bit, and the last bit decides what a renderer shows.
     """
     return _StraightThrough.apply(x, values.detach(), inside)
+
+
+def signs(x: Tensor) -> Tensor:
+    """Return +1 where x >= 0, else -1; gradient 1 for |x| <= 1, else 0."""
+    return straight_through(x, torch.where(x >= 0, 1.0, -1.0), x.detach().abs() <= 1)
+
+
+def hard_mask(x: Tensor, threshold: float, weight: float | Tensor = 1.0) -> Tensor:
+    """Return 1 where sigmoid(x) * weight > threshold, else 0; the gradient is that of sigmoid(x) * weight."""
+    soft = torch.sigmoid(x) * weight
+    return straight_through(soft, soft > threshold)

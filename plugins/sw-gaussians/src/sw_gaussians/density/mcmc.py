@@ -38,8 +38,12 @@ class MCMCSettings(Params):
     growth: float = Field(0.05, ge=0, description="share of Gaussians that are added each time")
     min_opacity: float = Field(0.005, gt=0, lt=1, description="Gaussians up to this opacity are dead: relocated")
     noise: float = Field(5e5, ge=0, description="strength of the noise on the means, times their step size")
+    noise_stop: int | None = Field(None, ge=0, description="no noise from this step on; None: until the end")
     opacity_weight: float = Field(0.01, ge=0, description="weight of the mean opacity in the loss")
     scale_weight: float = Field(0.01, ge=0, description="weight of the mean scale in the loss, world units")
+    terms_stop: int | None = Field(
+        None, ge=0, description="neither of the two in the loss from this step on; None: until the end"
+    )
     init_opacity: float = Field(0.5, gt=0, lt=1, description="opacity at the start")
     init_scale: float = Field(0.1, gt=0, description="scales at the start, times the distance to the neighbours")
 
@@ -70,7 +74,9 @@ class MCMC(DensityControl):
 
     def pre_tasks(self) -> Iterable[DensityTask]:
         # It belongs to the update of the step before, and to that step's learning rate.
-        return [("add noise", None, self.shake)] if self.settings.noise > 0 else []
+        stop = self.settings.noise_stop
+        when = None if stop is None else range(stop)
+        return [("add noise", when, self.shake)] if self.settings.noise > 0 else []
 
     def post_tasks(self) -> Iterable[DensityTask]:
         return ("relocate", self.rounds, self.adjust), ("grow", self.rounds, self.add)
@@ -96,8 +102,13 @@ class MCMC(DensityControl):
         return {"added": added}
 
     def regularised(self, loss: LossPack, result: RenderResult, step: int) -> LossPack:
-        """Add the opacity and scale regularisers, which turn unneeded Gaussians into dead ones."""
+        """Add the opacity and scale regularisers, which turn unneeded Gaussians into dead ones, until they stop."""
         settings, inputs = self.settings, result.inputs
+        if settings.terms_stop is not None:
+            stop = self.when(settings.terms_stop)
+            assert isinstance(stop, int)
+            if step >= stop:
+                return loss
         if inputs.scales is None:
             raise TypeError("density=mcmc needs a model with scales: that of 3dgs has them")
         parts = {"opacity": inputs.opacities.mean(), "scale": inputs.scales.mean()}

@@ -1,4 +1,4 @@
-// What adam_many is handed, checked alike on the CPU and on CUDA.
+// What adam_many is handed, checked.
 #pragma once
 
 #include <ATen/core/Tensor.h>

@@ -213,6 +213,15 @@ std::vector<int64_t> adam_many(const std::vector<at::Tensor>& params, const std:
 
 }  // namespace
 
+TORCH_LIBRARY(splatwizard_training, m) {
+  // Differentiable: offset + weighted sum, L1, SSIM, none of which the host waits for.
+  m.def("photometric_loss(Tensor x, Tensor y, bool valid, float l1_weight, float ssim_weight, float offset)"
+        " -> (Tensor total, Tensor l1, Tensor similarity)");
+  m.def("activate(Tensor log_scales, Tensor opacity_logits) -> (Tensor scales, Tensor opacities)");
+  m.def("adam_many(Tensor(a!)[] params, Tensor[] grads, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs, float[] lrs,"
+        " float[] beta1s, float[] beta2s, float[] epss, int[] steps) -> int[]");
+}
+
 TORCH_LIBRARY_IMPL(splatwizard_training, CUDA, m) {
   m.impl("adam_many", adam_many);
 }

@@ -1,14 +1,16 @@
-// How a kernel runs in parallel without including a torch header: the binding file hands it a `Parallel`.
+// How a kernel runs in parallel without knowing who lends the threads: it is handed a `Parallel`.
 //
 //   void scale(float* x, int64_t n, const splatwizard::Parallel& parallel) {
 //     parallel(n, 4096, [&](int64_t begin, int64_t end) { for (int64_t i = begin; i < end; ++i) x[i] *= 2; });
 //   }
 //
-// The binding file gets one from <splatwizard/torch_parallel.h>: it runs on torch's own thread pool and obeys
-// torch.set_num_threads. How a range is cut depends on the number of threads, so a kernel whose result must not
+// The threads are those of splatwizard_native/pool, as many as torch.get_num_threads() says, or torch's own in a binding
+// file (<splatwizard/torch_parallel.h>). How a range is cut depends on their number, so a kernel whose result must not
 // depend on it computes every element in one order whatever the cut, or reduces per fixed block.
 #pragma once
+#include <atomic>
 #include <cstdint>
+#include <exception>
 #include <type_traits>
 
 namespace splatwizard {
@@ -16,14 +18,30 @@ namespace splatwizard {
 struct Parallel {
   using Body = void (*)(void* state, int64_t begin, int64_t end);
   // Calls body(state, begin, end) on disjoint ranges that cover [0, count), each at least `grain` long but the last.
-  void (*run)(int64_t count, int64_t grain, Body body, void* state);
+  // Null: all of it is done here.
+  void (*run)(int32_t threads, int64_t count, int64_t grain, Body body, void* state);
   int threads;
 
+  // The first exception of a body is thrown again here: none passes through whoever lends the threads.
   template <class F>
   void operator()(int64_t count, int64_t grain, F&& body) const {
-    using Plain = std::remove_reference_t<F>;
-    auto call = [](void* state, int64_t begin, int64_t end) { (*static_cast<Plain*>(state))(begin, end); };
-    run(count, grain, call, const_cast<void*>(static_cast<const void*>(&body)));
+    if (count <= 0) return;
+    if (run == nullptr || threads < 2) return body(int64_t{0}, count);
+    struct State {
+      std::remove_reference_t<F>* body;
+      std::atomic<bool> failed{false};
+      std::exception_ptr error;
+    } state{&body, {}, {}};
+    auto call = [](void* at, int64_t begin, int64_t end) {
+      State& told = *static_cast<State*>(at);
+      try {
+        (*told.body)(begin, end);
+      } catch (...) {
+        if (!told.failed.exchange(true)) told.error = std::current_exception();
+      }
+    };
+    run(threads, count, grain, call, &state);
+    if (state.failed) std::rethrow_exception(state.error);
   }
 };
 

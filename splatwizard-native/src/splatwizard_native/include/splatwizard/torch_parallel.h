@@ -6,7 +6,7 @@
 namespace splatwizard {
 
 inline Parallel torch_parallel() {
-  auto run = [](int64_t count, int64_t grain, Parallel::Body body, void* state) {
+  auto run = [](int32_t, int64_t count, int64_t grain, Parallel::Body body, void* state) {
     at::parallel_for(0, count, grain, [&](int64_t begin, int64_t end) { body(state, begin, end); });
   };
   return {run, at::get_num_threads()};

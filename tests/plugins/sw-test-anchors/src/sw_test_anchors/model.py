@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from splatwizard_core.api import PluginManager
 from sw_codecs.entropy.rates import gaussian_bits
-from sw_codecs.quantizers.rounding import add_noise
+from sw_codecs.quantizers.multiples import add_noise
 
 POSITION_BITS = 16
 OCTAVES = 5
