@@ -21,9 +21,9 @@ def fitted_context(
     values: Tensor,
     base_steps: Tensor,
     *,
-    updates: int = 600,
-    batch: int = 4096,
-    lr: float = 0.005,
+    updates: int = 800,
+    batch: int = 2048,
+    lr: float = 0.01,
     seed: int = 0,
 ) -> ContextNetworks:
     """Networks that code values in few bits with base steps, one subset of splats and no refinements.
