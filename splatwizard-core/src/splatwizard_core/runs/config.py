@@ -33,6 +33,7 @@ __all__ = ["ResolvedConfig", "apply_overrides", "parse_set", "rate_points", "rea
 RESERVED = ("method", "preset", "rate", "scene")
 SCENE_KEYS = tuple(SceneParams.model_fields)
 PRETRAINED = "pretrained."  # keys of the method whose trained scene a run starts from
+USUAL_SOURCES = ("preset '", "data set '", "rate '")  # how the provenance of what the method itself says begins
 METRICS = "metrics."  # keys of the settings of metrics: metrics.GROUP.KEY
 INIT = "init"  # a .ply in place of that scene; a method that has a key of this name means its own
 TABLES = ("pretrained", "metrics")
@@ -86,6 +87,10 @@ class ResolvedConfig:
         """Whether a key has its value from the config.toml of a run."""
         source = self.provenance.get(key, "")
         return source.endswith(".toml") and os.path.isfile(source) and is_whole(source)
+
+    def is_usual(self, key: str) -> bool:
+        """Whether a key has its value from the method's preset, data set or rate point, not from the user."""
+        return self.provenance.get(key, "").startswith(USUAL_SOURCES)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values by block, None included, as the record keeps them."""
@@ -304,9 +309,9 @@ def resolve(
     init, pretrained, settings = "", dict[str, Any](), dict[str, Any]()
     provenance: dict[str, str] = {}
     for source, layer in (
-        (f"preset '{preset}'", method.PRESETS[preset]),
-        (f"data set '{family}'", method.BY_DATASET.get(family or "", {})),
-        (f"rate '{rate}'", method.RATES[rate]),
+        (f"{USUAL_SOURCES[0]}{preset}'", method.PRESETS[preset]),
+        (f"{USUAL_SOURCES[1]}{family}'", method.BY_DATASET.get(family or "", {})),
+        (f"{USUAL_SOURCES[2]}{rate}'", method.RATES[rate]),
         (str(config_file), flatten(method.Config, flatten(PipelineParams, tables))),
         ("--set", sets or {}),
     ):

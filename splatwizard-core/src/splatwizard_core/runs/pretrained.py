@@ -137,10 +137,13 @@ def checked_start(plugins: PluginManager, resolved: ResolvedConfig) -> ResolvedC
         method, parsed = make_method(plugins, resolved), dict(resolved.pretrained)
         names, first = named_scenes(method), first_scene(method)
         if resolved.init and names == [first]:
-            key = f"pretrained.{next(iter(parsed))}"
+            asked = [key for key in (f"pretrained.{name}" for name in parsed) if not resolved.is_usual(key)]
+            if not asked:  # what a preset says of the scene to train has no say where a file is that scene
+                return checked_start(plugins, replace(resolved, pretrained={}))
             raise ConfigError(
-                f"'{key}' is about training a {first} scene, and 'init' ({resolved.init}) is one: give one of them",
-                key=key,
+                f"'{asked[0]}' is about training a {first} scene, and 'init' ({resolved.init}) is one: give one of "
+                "them",
+                key=asked[0],
             )
         for base in (base_config(plugins, name, resolved) for name in names):
             parsed |= {k: value_at(base.config, k) for k in parsed if field_at(type(base.config), k) is not None}

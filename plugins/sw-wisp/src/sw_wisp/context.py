@@ -1,0 +1,145 @@
+"""Networks that predict the 22 numbers of a splat from the running means around it, as they are trained.
+
+How a training uses them, with `net = ContextNetworks(base_steps)` and N splats:
+
+    features = walked_features(net.prior, levels, cells, values / base_steps, indices)   # every 100 or 200 steps
+    forecast, drawn = net(*features, numbers, draw)         # at each step, for all splats that are drawn
+    bits(drawn - forecast.mean, sigma_of(forecast.scale, forecast.steps), forecast.steps)   # [N,22], differentiable
+
+`numbers` are the 22 values [N,22], `draw(values, mean, steps)` is what stands in for rounding (noise, soft or hard
+rounding) of the columns of one block: the next block's network sees what it returned. `forecast.mean`, `.scale` and
+`.steps` have gradients to the networks; features are constants, rows of them follow the splats. Once, before the first
+step with a rate: `net.start(features[0], features[1], values / base_steps)`. `net.rounds = True`: weights as in the
+file. `net.exact()`: the context of the file, for `Scene(context=...)`; that file's integers are the closed loop, so a
+training that fixes them takes those of `file.encode`, not its own rounding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
+
+from sw_codecs.context.two_layers import two_layers
+from sw_codecs.entropy.exact_tables import exact_tables
+from sw_wisp.eight_bits import EXACT_EXPONENT, EightBitLayer, rounded_weights
+from sw_wisp.nested import UNIT
+from sw_wisp.numbers import BASE_STEPS, BLOCKS, NUMBERS
+from sw_wisp.predicting import STEPS_OF, PyramidContext, network_shapes
+from sw_wisp.rate import level_of
+from sw_wisp.static import MEAN_UNIT
+
+LARGEST_PRIOR = 32767 * MEAN_UNIT
+Draw = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""(values, mean, steps) [N,c] -> values as they are drawn."""
+
+
+class Forecast(NamedTuple):
+    """Distributions of the 22 numbers of N splats, each [N,22].
+
+    mean    in the units of the numbers
+    scale   level 0..63 of the table: linear in the logarithm of the deviation in steps
+    steps   quantiser steps, in the units of the numbers
+    """
+
+    mean: Tensor
+    scale: Tensor
+    steps: Tensor
+
+
+class ContextNetworks(nn.Module):
+    """Four networks, for opacity; shape and size; colour; latents: 13,353 numbers.
+
+    base_steps  [22] quantiser steps for a multiplier of 1
+    prior       [22] int64 means where nothing is known, base steps with 12 fractional bits, multiples of 16
+    adaptive    whether steps are what the networks say, or base steps
+    rounds      whether weights are those of the file, of eight bits, with straight-through gradients
+    """
+
+    base_steps: Tensor
+    prior: Tensor
+    multipliers: Tensor
+
+    def __init__(
+        self, base_steps: Tensor | None = None, *, adaptive: bool = True, generator: torch.Generator | None = None
+    ) -> None:
+        super().__init__()
+        self.adaptive, self.rounds = adaptive, False
+        self.networks = nn.ModuleList(
+            two_layers(inputs, hidden, outputs, generator, start="silent")
+            for inputs, hidden, outputs in network_shapes()
+        )
+        steps = torch.tensor(BASE_STEPS) if base_steps is None else base_steps
+        self.register_buffer("base_steps", steps.float())
+        self.register_buffer("prior", torch.zeros(NUMBERS, dtype=torch.int64))
+        table = torch.from_numpy(exact_tables().multipliers / UNIT).float()
+        self.register_buffer("multipliers", table, persistent=False)
+
+    def forward(
+        self, features: Tensor, view_features: Tensor, values: Tensor, draw: Draw | None = None
+    ) -> tuple[Forecast, Tensor]:
+        """Forecast for splats of features [N,69] (those of latents: `view_features`) and values [N,22], and the drawn.
+
+        draw    None: values as they are
+        """
+        parts: list[tuple[Tensor, Tensor, Tensor]] = []
+        drawn = values[:, :0]
+        for number, block in enumerate(BLOCKS):
+            own = view_features if number == len(BLOCKS) - 1 else features
+            unit, width = self.base_steps[block], block.stop - block.start
+            known = (drawn / self.base_steps[: block.start]).detach()
+            out = self._evaluate(number, torch.cat([own, known], dim=1))
+            mean = (own[:, block] + out[:, :width]) * unit
+            steps = (self._multipliers(out[:, 2 * width :])[:, STEPS_OF[number]] * unit).expand(len(values), -1)
+            part = values[:, block]
+            drawn = torch.cat([drawn, part if draw is None else draw(part, mean, steps)], dim=1)
+            parts.append((mean, out[:, width : 2 * width], steps))
+        mean, scale, steps = (torch.cat(each, dim=1) for each in zip(*parts, strict=True))
+        return Forecast(mean, scale, steps), drawn
+
+    def _evaluate(self, number: int, inputs: Tensor) -> Tensor:
+        first, _, last = self.networks[number]  # type: ignore[misc, union-attr]
+        weights = [layer.weight for layer in (first, last)]
+        if self.rounds:
+            weights = [rounded_weights(weight, EXACT_EXPONENT) for weight in weights]
+        found: Tensor = F.linear(torch.relu(F.linear(inputs, weights[0], first.bias)), weights[1], last.bias)
+        return found
+
+    def _multipliers(self, t: Tensor) -> Tensor:
+        """Steps in base steps for outputs t: those of the table, with the gradient of 1 + tanh t."""
+        if not self.adaptive:
+            return torch.ones_like(t)
+        place = ((t.detach() + 8) * 8).floor().clamp(0, len(self.multipliers) - 1).long()
+        smooth = torch.tanh(t)
+        return self.multipliers[place] + (smooth - smooth.detach())
+
+    @torch.no_grad()
+    def measure_prior(self, values: Tensor) -> None:
+        """Take the means of values [N,22] in base steps."""
+        mean = (values.double().mean(0) * (UNIT / MEAN_UNIT)).round().long() * MEAN_UNIT
+        self.prior.copy_(mean.clamp(-LARGEST_PRIOR, LARGEST_PRIOR))
+
+    @torch.no_grad()
+    def start(self, features: Tensor, view_features: Tensor, values: Tensor) -> None:
+        """Predict the running means, with the deviation from them that values [N,22] (base steps) have on the whole."""
+        for number, block in enumerate(BLOCKS):
+            own = view_features if number == len(BLOCKS) - 1 else features
+            last = self.networks[number][-1]  # type: ignore[index]
+            last.weight.zero_()
+            last.bias.zero_()
+            width = block.stop - block.start
+            step = float(self._multipliers(last.bias[:1]))
+            sigma = (values[:, block] - own[:, block]).square().mean(0).sqrt()
+            last.bias[width : 2 * width] = level_of(sigma.clamp_min(1e-6), step)
+
+    def exact(self) -> PyramidContext:
+        """The same as the file holds it."""
+        layers = []
+        for network in self.networks:
+            for layer in (network[0], network[-1]):  # type: ignore[index]
+                arrays = [each.detach().cpu().double().numpy() for each in (layer.weight, layer.bias)]
+                layers.append(EightBitLayer.nearest(*arrays, lowest=EXACT_EXPONENT))
+        return PyramidContext(self.prior.cpu().numpy(), tuple(layers), self.adaptive)

@@ -1,0 +1,75 @@
+"""From a trained 3DGS scene to splats of wisp."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from splatwizard_core.api import GaussianModel
+from sw_wisp.appearance import AppearanceNetwork, colour_of
+from sw_wisp.cube import Cube
+from sw_wisp.model import WispModel
+from sw_wisp.numbers import LATENTS, LOWEST_LEVEL
+from sw_wisp.positions import MARGIN
+from sw_wisp.rate_model import PyramidRate, StaticRate
+from sw_wisp.shape import log_covariance
+from sw_wisp.worth import slopes, worth
+
+if TYPE_CHECKING:
+    from splatwizard_core.api import Rasterizer, View
+    from sw_wisp.config import WispConfig
+
+HEAD_ROOM = 1.5
+"""Splats that may begin, in caps: removal takes the rest while it trains."""
+
+
+def kept_rows(costs: Tensor, config: WispConfig) -> Tensor:
+    """Return the rows [M] int64, ascending, that begin: as many as the cap lets of the worthiest, few that do harm.
+
+    costs   [N] of removal: at most 0 where the pictures are as good without
+    """
+    n = len(costs)
+    cap = round(HEAD_ROOM * config.budget.cap * config.budget.cap_factor)
+    harmful = min(int((costs <= 0).sum()), int(config.budget.worthless * n))
+    keep = max(1, min(n - harmful, cap))
+    return torch.sort(costs, descending=True, stable=True).indices[:keep].sort().values
+
+
+def converted(
+    model: GaussianModel,
+    views: Sequence[View],
+    rasterizer: Rasterizer,
+    background: Tensor,
+    config: WispConfig,
+    generator: torch.Generator,
+) -> WispModel:
+    """Return the splats of a trained scene, at level 3 all of them; the stage sets levels by its rule.
+
+    generator   of random signs and of the network's first weights, on the CPU
+    """
+    model.active_sh_degree = model.max_sh_degree
+    found = worth(model, views, rasterizer, background, lambda_dssim=config.loss.lambda_dssim)
+    rows = kept_rows(found.squared_error, config)
+    network = AppearanceNetwork(
+        LATENTS.width, config.appearance.hidden, max(model.max_sh_degree, 1), generator=generator
+    ).to(background.device)
+    with torch.no_grad():
+        if model.max_sh_degree:
+            weights = slopes(model, ["sh_rest"], views, rasterizer, background, generator)["sh_rest"].flatten(1).mean(1)
+            latents = network.fit(model.sh_rest[rows], weights[rows])
+        else:
+            latents = model.means.new_zeros(len(rows), LATENTS.width)
+        shape, size = log_covariance(model.log_scales.double(), model.quats.double())
+        means = model.means[rows].detach()
+        steps = torch.tensor(config.base_steps)
+        rate: StaticRate | PyramidRate = StaticRate(steps)
+        if config.context.kind == "pyramid":
+            rate = PyramidRate(steps, adaptive=config.steps.adaptive, generator=generator)
+        return WispModel(
+            means, model.opacity_logits[rows], shape[rows], size[rows], colour_of(model.sh_dc)[rows], latents,
+            torch.full((len(rows),), LOWEST_LEVEL, device=background.device), cube=Cube.around(means, margin=MARGIN),
+            network=network, rate=rate.to(background.device), sharpest=config.phases.sharpness,
+        )  # fmt: skip

@@ -1,0 +1,62 @@
+"""Wisp as a method: explicit splats, trained with the bits of the file in the loss, in one file of integers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import torch
+
+from splatwizard_core.api import BitstreamError, Method, SceneError
+from sw_wisp import file
+from sw_wisp.appearance import AppearanceNetwork
+from sw_wisp.config import WispConfig
+from sw_wisp.model import WispModel, plain_gaussians
+from sw_wisp.presets import BY_DATASET, PRESETS, RATES
+from sw_wisp.stage import WispStage
+
+if TYPE_CHECKING:
+    from splatwizard_core.api import ContainerReader, ContainerWriter, Scene, SplatModel, Stage
+
+
+class Wisp(Method):
+    """Explicit splats, each in a cell of an octree, its shape a log covariance, its view dependence twelve latents.
+
+    1. START    from a trained 3DGS scene that has more splats than stay
+    2. TRAIN    with noise in place of rounding and the bits of the file in the loss; a splat whose bits cost more than
+                the exact price of its removal goes
+    3. ENCODE   residuals against what the decoder knows, by integer arithmetic
+    4. DECODE   to a plain GaussianModel: no network runs when it is drawn
+    """
+
+    name: ClassVar[str] = "wisp"
+    version: ClassVar[int] = 1
+    Config = WispConfig
+    PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = PRESETS
+    BY_DATASET: ClassVar[Mapping[str, Mapping[str, Any]]] = BY_DATASET
+    RATES: ClassVar[Mapping[str, Mapping[str, Any]]] = RATES
+    DEFAULT_RATE: ClassVar[str] = "r3"
+
+    def create_model(self, scene: Scene, generator: torch.Generator) -> SplatModel:
+        """Raise SceneError: training starts from a trained scene, and there is no start from points."""
+        raise SceneError(f"{self.name} starts from a trained 3dgs scene, not from points", path=scene.path)
+
+    def stages(self) -> Sequence[Stage]:
+        return [WispStage(self.config)]
+
+    def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
+        if not isinstance(model, WispModel):
+            raise TypeError(f"wisp encodes its own splats, not a {type(model).__name__}")
+        file.encode(model.coded(), writer)
+
+    def decode(self, reader: ContainerReader) -> SplatModel:
+        self.check_version(reader)
+        decoded = file.decode(reader)
+        levels = torch.from_numpy(decoded.state.levels)
+        log_edges = math.log(decoded.cube.edge) - math.log(2.0) * levels
+        try:
+            network = AppearanceNetwork.of_layers(decoded.appearance, decoded.sh_degree)
+        except ValueError as error:
+            raise BitstreamError(f"{reader.name}: {error}", section="networks") from error
+        return plain_gaussians(decoded.means(), decoded.values(), log_edges.float(), decoded.cube, network)

@@ -1,0 +1,234 @@
+"""The model while it trains: splats as the 22 numbers that the file holds, drawn as what rounding leaves of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+from splatwizard_core.api import SH, GaussianInputs, GaussianModel, SplatModel
+from sw_codecs.positions import morton
+from sw_wisp.appearance import AppearanceNetwork, sh_dc_of
+from sw_wisp.context import Forecast
+from sw_wisp.cube import Cube
+from sw_wisp.file import Scene
+from sw_wisp.numbers import COLOUR, GROUPS, LATENTS, OPACITY, SHAPE, SIZE
+from sw_wisp.octree import Cells, position_bits
+from sw_wisp.pyramid import FEATURES
+from sw_wisp.rate_model import Placed, PyramidRate, StaticRate, bits_of
+from sw_wisp.rounding import FINAL, FLOAT, HARD, disturbed
+from sw_wisp.shape import bounded, covariance, scales_and_quats
+
+if TYPE_CHECKING:
+    from splatwizard_core.api import Camera, Rasterizer
+
+THINNEST = 1e-6
+"""Smallest standard deviation, in edges of the root cube; the largest is the edge itself."""
+
+
+def bounds_in(cube: Cube) -> tuple[float, float]:
+    """Return the bounds of the log scales of splats in a root cube."""
+    return math.log(THINNEST * cube.edge), math.log(cube.edge)
+
+
+@torch.no_grad()
+def plain_gaussians(
+    means: Tensor, values: Tensor, log_edges: Tensor, cube: Cube, network: AppearanceNetwork
+) -> GaussianModel:
+    """Return splats as Gaussians that need no network to be drawn.
+
+    means       [N,3] world units
+    values      [N,22] their numbers
+    log_edges   [N] logarithms of the edges of their cells
+    """
+    opacity, shape, size, colour, latents = (values[:, group.columns] for group in GROUPS)
+    shape, size = bounded(shape, size.squeeze(1) + log_edges, *bounds_in(cube))
+    rest = network(latents, colour)
+    return GaussianModel.from_tensors(means, sh_dc_of(colour), rest, opacity.squeeze(1), *scales_and_quats(shape, size))
+
+
+class WispModel(SplatModel):
+    """N splats.
+
+    means       [N,3] world units
+    opacity     [N] logit
+    shape       [N,5] deviator of the log covariance
+    size        [N] mean log scale, world units; the file has it relative to the edge of the splat's cell
+    colour      [N,3] luma and chroma
+    latents     [N,12] view dependence
+    levels      [N] int64, level of the octree
+    features, view_features
+                [N,69] what networks of the rate model see of the splats before; only where it has networks
+    network     latents and colour to SH bands 1 and up
+    rate        distributions of the 22 numbers
+    cube        the root cube of the octree
+
+    phase       what is drawn: see `rounding`; in eval mode noise and soft rounding are left out
+    sharpness   of soft rounding, up to `sharpest`
+    jitters     whether positions are drawn anywhere in a cell of the splat's level around them
+    """
+
+    ROWS = ("means", "opacity", "shape", "size", "colour", "latents", "levels")
+    NUMBERS = ("opacity", "shape", "size", "colour", "latents")
+    """The parameters that hold the 22 numbers, in their order."""
+
+    levels: Tensor
+
+    def __init__(
+        self, means: Tensor, opacity: Tensor, shape: Tensor, size: Tensor, colour: Tensor, latents: Tensor,
+        levels: Tensor, *, cube: Cube, network: AppearanceNetwork, rate: StaticRate | PyramidRate,
+        sharpest: float = 8.0,
+    ) -> None:  # fmt: skip
+        super().__init__()
+        rows = {
+            "means": means, "opacity": opacity, "shape": shape, "size": size, "colour": colour, "latents": latents
+        }  # fmt: skip
+        for name, values in rows.items():
+            self.register_parameter(name, nn.Parameter(values.detach().float().contiguous()))
+        self.register_buffer("levels", levels)
+        for name in rate.CONTEXT:
+            if name not in self.ROWS:
+                self.register_buffer(name, means.new_zeros(len(means), FEATURES))
+                self.ROWS = (*self.ROWS, name)
+        self.network, self.rate = network, rate
+        self.cube = cube
+        self.phase, self.sharpness, self.sharpest, self.jitters = FLOAT, 1.0, sharpest, False
+        self.split_seed = 0
+
+    def log_edges(self, levels: Tensor) -> Tensor:
+        """Logarithms [N] of the edges of cells at levels [N]."""
+        return math.log(self.cube.edge) - math.log(2.0) * levels.float()
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Bounds of the log scales."""
+        return bounds_in(self.cube)
+
+    def numbers(self, rows: Tensor | None = None) -> Tensor:
+        """The 22 numbers [N,22] of all splats or of some rows, size relative to the cell; differentiable."""
+
+        def of(name: str) -> Tensor:
+            values: Tensor = getattr(self, name)
+            return values if rows is None else values.index_select(0, rows)
+
+        levels = self.levels if rows is None else self.levels.index_select(0, rows)
+        size = of("size") - self.log_edges(levels)
+        return torch.cat([of("opacity")[:, None], of("shape"), size[:, None], of("colour"), of("latents")], dim=1)
+
+    @torch.no_grad()
+    def set_numbers(self, values: Tensor) -> None:
+        """Take the 22 numbers [N,22] of all splats, size relative to the cell, in place."""
+        opacity, shape, size, colour, latents = (values[:, group.columns] for group in GROUPS)
+        self.opacity.copy_(opacity.squeeze(1))
+        self.shape.copy_(shape)
+        self.size.copy_(size.squeeze(1) + self.log_edges(self.levels))
+        self.colour.copy_(colour)
+        self.latents.copy_(latents)
+
+    def predicted(self, rows: Tensor | None = None) -> tuple[Forecast, Tensor]:
+        """Distributions of the numbers of all splats, or of some rows, and these [N,22] as this phase rounds them."""
+        context = (getattr(self, name) for name in self.rate.CONTEXT)
+        context = context if rows is None else (each.index_select(0, rows) for each in context)
+        return self.rate.predict(tuple(context), self.numbers(rows), self._rounded)
+
+    @property
+    def _rounds(self) -> bool:
+        return self.phase == HARD or (self.training and self.phase not in (FLOAT, FINAL))
+
+    def _rounded(self, values: Tensor, mean: Tensor, steps: Tensor) -> Tensor:
+        return disturbed(values, mean, steps, self.phase, self.sharpness, self.sharpest) if self._rounds else values
+
+    def drawn(self) -> Tensor:
+        """The 22 numbers [N,22] of all splats as they are drawn; differentiable."""
+        return self.predicted()[1] if self._rounds else self.numbers()
+
+    def bits(self, rows: Tensor | None = None) -> Tensor:
+        """Bits [N,22] of the numbers of all splats, or of some rows, as this phase rounds them; differentiable."""
+        forecast, drawn = self.predicted(rows)
+        return bits_of(drawn, forecast)
+
+    def begin_rate(self) -> None:
+        """Start the rate model anew from the splats."""
+        self._take(self.rate.begin(self._placed()))
+
+    def measure(self) -> None:
+        """Bring the rate model up to date with the splats; once the integers are fixed, only what it reads."""
+        again = self.rate.reread if self.phase == FINAL else self.rate.measure
+        self._take(again(self._placed(), tuple(getattr(self, name) for name in self.rate.CONTEXT)))
+
+    def _placed(self) -> Placed:
+        return Placed(self.numbers().detach(), self.levels, self.cube.cells(self.means, self.levels))
+
+    def _take(self, rows: Mapping[str, Tensor]) -> None:
+        for name, values in rows.items():
+            setattr(self, name, values)
+
+    @torch.no_grad()
+    def place_bits(self) -> Tensor:
+        """Bits [N] float64 of each splat's place in the octree, by coding them; bits that several need are shared."""
+        levels, cells = self.cube.settled(self.means, self.levels, self.opacity)
+        codes = morton.encode(cells.cpu().numpy())
+        return torch.from_numpy(position_bits(Cells(levels.cpu().numpy(), codes))).to(self.device)
+
+    def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
+        """All splats, whatever the camera."""
+        values = self.drawn()
+        means, edges = self.means, self.log_edges(self.levels)
+        if self.jitters and self.training:
+            means = means + (torch.rand_like(means) - 0.5) * edges.exp()[:, None]
+        colour = values[:, COLOUR.columns]
+        return GaussianInputs(
+            means=means,
+            opacities=torch.sigmoid(values[:, OPACITY.columns].squeeze(1)),
+            cov3d=covariance(
+                values[:, SHAPE.columns], values[:, SIZE.columns].squeeze(1) + edges, *self.bounds
+            ),
+            sh=SH(
+                dc=sh_dc_of(colour),
+                rest=self.network(values[:, LATENTS.columns], colour),
+                active_degree=self.network.degree,
+            ),
+        )  # fmt: skip
+
+    @torch.no_grad()
+    def tidied(self) -> dict[str, Tensor]:
+        """The 22 numbers by parameter, within the ranges that are kept; shapes within the bounds of the root cube."""
+        shape, size = bounded(self.shape, self.size, *self.bounds)
+        edges = self.log_edges(self.levels)
+        limits = {group.name: group.limit for group in GROUPS}
+        size = (size - edges).clamp(-limits["size"], limits["size"]) + edges
+        found = {"opacity": self.opacity, "shape": shape, "size": size, "colour": self.colour, "latents": self.latents}
+        return {k: v if k == "size" else v.detach().clamp(-limits[k], limits[k]) for k, v in found.items()}
+
+    @torch.no_grad()
+    def as_gaussians(self) -> GaussianModel:
+        """The plain Gaussians that are drawn in eval mode, with all SH bands."""
+        return plain_gaussians(self.means, self.drawn(), self.log_edges(self.levels), self.cube, self.network)
+
+    @torch.no_grad()
+    def coded(self) -> Scene:
+        """What the file holds: of a trained model the integers that the training has fixed."""
+        levels, cells = self.cube.settled(self.means, self.levels, self.opacity)
+        values = self.numbers()
+        values[:, SIZE.columns] += (self.log_edges(self.levels) - self.log_edges(levels))[:, None]
+        return Scene(
+            self.cube, levels, cells, values, self.network.layers(), sh_degree=self.network.degree,
+            base_steps=tuple(self.rate.base_steps.tolist()), context=self.rate.exact(), in_order=self.phase == FINAL,
+        )  # fmt: skip
+
+    def state_dict_extra(self) -> dict[str, Any]:
+        modes = {"phase": self.phase, "sharpness": self.sharpness, "jitters": self.jitters}
+        modes |= {"rounds": self.network.rounds}
+        return {**modes, "seed": self.split_seed, "low": list(self.cube.low), "edge": self.cube.edge}
+
+    def load_state_dict_extra(self, extra: dict[str, Any]) -> None:
+        self.phase, self.sharpness = str(extra["phase"]), float(extra["sharpness"])
+        self.jitters, self.split_seed = bool(extra["jitters"]), int(extra["seed"])
+        self.network.rounds = bool(extra["rounds"])
+        if self.network.rounds:
+            self.rate.round_weights()
+        low = [float(x) for x in extra["low"]]
+        self.cube = Cube((low[0], low[1], low[2]), float(extra["edge"]))

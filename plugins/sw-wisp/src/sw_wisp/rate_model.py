@@ -1,0 +1,221 @@
+"""Rate models: how the 22 numbers of a splat are distributed, in training and for the file alike.
+
+`StaticRate`: a mean and a table of the file's Gaussians for each number and octree level. `PyramidRate`: networks that
+see running means of the splats before. What is trained is what is coded: bits of a training step are those of a
+Gaussian of the table's deviation, and `exact` is what the file holds.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from sw_wisp.context import ContextNetworks, Draw, Forecast
+from sw_wisp.nested import UNIT, index_bits
+from sw_wisp.numbers import HIGHEST_LEVEL, LOWEST_LEVEL, NUMBERS
+from sw_wisp.pyramid import walked_features
+from sw_wisp.rate import bits, sigma_of
+from sw_wisp.static import ENOUGH, MEAN_UNIT, StaticContext
+
+if TYPE_CHECKING:
+    from sw_wisp.packets import Context
+    from sw_wisp.predicting import PyramidContext
+
+TABLES = 64
+WINDOW = 255
+"""Indices that are told apart when a table is chosen; those beyond count as the last."""
+LEVELS = HIGHEST_LEVEL - LOWEST_LEVEL + 1
+LARGEST_MEAN = 32767
+"""Of the file, in units of 16/4096 base steps."""
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Splats as a rate model measures them.
+
+    values      [N,22] their numbers
+    levels      [N] int64 levels of the octree, and cells [N,3] at these
+    """
+
+    values: Tensor
+    levels: Tensor
+    cells: Tensor
+
+
+class RateModel(Protocol):
+    """Protocol of rate models.
+
+    CONTEXT     rows of the model that it predicts from
+    base_steps  [22] quantiser steps where it says no others
+    """
+
+    CONTEXT: ClassVar[tuple[str, ...]]
+
+    @property
+    def base_steps(self) -> Tensor: ...
+
+    def begin(self, splats: Placed) -> dict[str, Tensor]:
+        """Start from these splats; return rows of the model, by name, for it to predict from."""
+        ...
+
+    def measure(self, splats: Placed, context: tuple[Tensor, ...]) -> dict[str, Tensor]:
+        """Come up to date with these splats; return rows of the model that are new, by name."""
+        ...
+
+    def reread(self, splats: Placed, context: tuple[Tensor, ...]) -> dict[str, Tensor]:
+        """Return rows of the model that are new, by name; what the file holds of the rate model stays."""
+        ...
+
+    def predict(self, context: tuple[Tensor, ...], values: Tensor, draw: Draw) -> tuple[Forecast, Tensor]:
+        """Return distributions of values [N,22], and the values as `draw` draws them under these; differentiable."""
+        ...
+
+    def round_weights(self) -> None:
+        """Compute with the weights of the file from here on."""
+        ...
+
+    def exact(self) -> Context:
+        """Return the same distributions in the integers of the file."""
+        ...
+
+
+def bits_of(values: Tensor, forecast: Forecast) -> Tensor:
+    """Return the bits [N,22] of the bins around drawn values [N,22]; differentiable in values and forecast."""
+    return bits(values - forecast.mean, sigma_of(forecast.scale, forecast.steps), forecast.steps)
+
+
+@functools.cache
+def _costs(device: torch.device) -> Tensor:
+    """[511,64]: bits of indices -255..255 under each table."""
+    indices = np.arange(-WINDOW, WINDOW + 1)
+    return torch.from_numpy(index_bits(np.arange(TABLES)[None], indices[:, None])).float().to(device)
+
+
+class StaticRate(nn.Module):
+    """Means and tables by level; no parameters, `measure` sets them.
+
+    base_steps      [22] float64 quantiser steps
+    row             [16] int64: which row of the next two serves levels 3..18
+    means           [16,22] int64 in base steps, 12 fractional bits
+    tables          [16,22] int64, 0..63
+    """
+
+    CONTEXT = ("levels",)
+
+    base_steps: Tensor
+    row: Tensor
+    means: Tensor
+    tables: Tensor
+
+    def __init__(self, base_steps: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("base_steps", base_steps.double())
+        self.register_buffer("row", torch.zeros(LEVELS, dtype=torch.int64))
+        self.register_buffer("means", torch.zeros(LEVELS, NUMBERS, dtype=torch.int64))
+        self.register_buffer("tables", torch.full((LEVELS, NUMBERS), 40))
+
+    def begin(self, splats: Placed) -> dict[str, Tensor]:
+        return self.measure(splats, ())
+
+    @torch.no_grad()
+    def measure(self, splats: Placed, context: tuple[Tensor, ...]) -> dict[str, Tensor]:
+        """Take the means, and for each the table of fewest bits."""
+        values, levels = splats.values, splats.levels
+        place = levels - LOWEST_LEVEL
+        counts = torch.bincount(place, minlength=LEVELS)
+        own = (counts >= ENOUGH) | (counts == counts.max())
+        at = torch.arange(LEVELS, device=levels.device)
+        self.row.copy_(((at[:, None] - at).abs() + LEVELS * ~own).argmin(dim=1))
+        served = self.row[place]  # [N]
+        units = values.double() / self.base_steps * UNIT
+        sums = units.new_zeros(LEVELS, NUMBERS).index_add_(0, served, units)
+        whole = torch.bincount(served, minlength=LEVELS).clamp_min(1)[:, None]
+        self.means.copy_((sums / whole / MEAN_UNIT).round().clamp(-LARGEST_MEAN, LARGEST_MEAN) * MEAN_UNIT)
+        k = ((units - self.means[served]) / UNIT).round().long().clamp(-WINDOW, WINDOW) + WINDOW
+        cell = (served[:, None] * NUMBERS + torch.arange(NUMBERS, device=levels.device)) * (2 * WINDOW + 1) + k
+        found = torch.bincount(cell.flatten(), minlength=LEVELS * NUMBERS * (2 * WINDOW + 1))
+        spent = found.view(LEVELS, NUMBERS, -1).float() @ _costs(values.device)  # [16,22,64]
+        self.tables.copy_(spent.argmin(dim=2))
+        return {}
+
+    def reread(self, splats: Placed, context: tuple[Tensor, ...]) -> dict[str, Tensor]:
+        return {}
+
+    def predict(self, context: tuple[Tensor, ...], values: Tensor, draw: Draw) -> tuple[Forecast, Tensor]:
+        (levels,) = context
+        row = self.row[levels - LOWEST_LEVEL]
+        means = (self.means * (self.base_steps / UNIT)).float()[row]
+        steps = self.base_steps.float().expand(len(levels), NUMBERS)
+        return Forecast(means, self.tables.float()[row], steps), draw(values, means, steps)
+
+    def round_weights(self) -> None:
+        """Do nothing: there are no weights."""
+
+    def exact(self) -> StaticContext:
+        used, row = torch.unique(self.row, return_inverse=True)
+        means, tables = self.means[used].cpu().numpy(), self.tables[used].cpu().numpy()
+        return StaticContext(row.cpu().numpy(), means, tables, np.full(NUMBERS, UNIT, np.int64))
+
+
+class PyramidRate(nn.Module):
+    """Networks on running means of the splats before (`sw_wisp.context`), whose features are rows of the model.
+
+    adaptive    whether quantiser steps follow the networks
+    """
+
+    CONTEXT = ("features", "view_features")
+
+    def __init__(self, base_steps: Tensor, *, adaptive: bool, generator: torch.Generator | None = None) -> None:
+        super().__init__()
+        self.networks = ContextNetworks(base_steps.float(), adaptive=adaptive, generator=generator)
+
+    @property
+    def base_steps(self) -> Tensor:
+        return self.networks.base_steps
+
+    @torch.no_grad()
+    def begin(self, splats: Placed) -> dict[str, Tensor]:
+        """Predict the running means alone."""
+        units = splats.values / self.base_steps
+        self.networks.measure_prior(units)
+        features = self._features(splats, units, (units - self.networks.prior / UNIT).round())
+        self.networks.start(*features, units)
+        return dict(zip(self.CONTEXT, features, strict=True))
+
+    @torch.no_grad()
+    def measure(self, splats: Placed, context: tuple[Tensor, ...]) -> dict[str, Tensor]:
+        """Walk through the splats as a file would hold them now."""
+        forecast, drawn = self.networks(*context, splats.values, _rounded)
+        indices = ((drawn - forecast.mean) / forecast.steps).round()
+        return dict(zip(self.CONTEXT, self._features(splats, drawn / self.base_steps, indices), strict=True))
+
+    @torch.no_grad()
+    def reread(self, splats: Placed, context: tuple[Tensor, ...]) -> dict[str, Tensor]:
+        """Walk through splats whose numbers are those of the file."""
+        forecast, _ = self.networks(*context, splats.values)
+        indices = ((splats.values - forecast.mean) / forecast.steps).round()
+        return dict(zip(self.CONTEXT, self._features(splats, splats.values / self.base_steps, indices), strict=True))
+
+    def _features(self, splats: Placed, units: Tensor, indices: Tensor) -> tuple[Tensor, Tensor]:
+        return walked_features(self.networks.prior, splats.levels, splats.cells, units, indices)
+
+    def predict(self, context: tuple[Tensor, ...], values: Tensor, draw: Draw) -> tuple[Forecast, Tensor]:
+        forecast: Forecast
+        forecast, drawn = self.networks(*context, values, draw)
+        return forecast, drawn
+
+    def round_weights(self) -> None:
+        """Compute with the weights of the file, of eight bits."""
+        self.networks.rounds = True
+
+    def exact(self) -> PyramidContext:
+        return self.networks.exact()
+
+
+def _rounded(values: Tensor, mean: Tensor, steps: Tensor) -> Tensor:
+    return mean + steps * ((values - mean) / steps).round()

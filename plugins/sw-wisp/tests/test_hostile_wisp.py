@@ -1,0 +1,147 @@
+"""A file from a stranger is refused, or decodes to finite splats, in memory bounded by the rows it may claim.
+
+A few hundred files in the default tests; more with `python -m pytest -m fuzz plugins/sw-wisp/tests -s`
+(SPLATWIZARD_FUZZ_FILES sets how many).
+"""
+
+import os
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from sw_kit.hostile_files import Mutator, Parts, Tally, attempt
+from test_context import some_networks
+from wisp_scenes import made_up
+
+from splatwizard_core.api import BitstreamError, ContainerReader, ContainerWriter
+from sw_wisp import file
+from sw_wisp.nested import Writer
+from sw_wisp.octree import Shares
+
+NOISE = 16 << 20  # of the allocator, and of the tables that are made once
+FREE = 1 << 24  # bytes of rows that any file may stand for
+FUZZ_FILES = int(os.environ.get("SPLATWIZARD_FUZZ_FILES", "10000"))
+
+
+def written(scene) -> bytes:
+    writer = ContainerWriter("wisp", 1)
+    file.encode(scene, writer)
+    return writer.to_bytes()
+
+
+@pytest.fixture(scope="module")
+def seeds() -> list[bytes]:
+    context = some_networks().exact()
+    return [
+        written(made_up(150)),
+        written(made_up(150, subsets=3, planes=1)),
+        written(replace(made_up(150), context=context)),
+        written(replace(made_up(150, subsets=2, planes=2), context=context)),
+        written(made_up(0)),
+    ]
+
+
+def decoded(data: bytes) -> str:
+    found = file.decode(ContainerReader(data))
+    assert bool(torch.isfinite(found.values()).all())
+    assert bool(torch.isfinite(found.means()).all())
+    assert len(found.digest()) == 64
+    return "decoded"
+
+
+def fuzz(seeds: list[bytes], number: int, seed: int) -> Tally:
+    tally, mutator = Tally(), Mutator(seed)
+    decoded(seeds[3])  # tables and native code are there
+    for i in range(number):
+        data, kind = mutator.file(seeds)
+        attempt(lambda data=data: decoded(data), f"file {seed}/{i} ({kind})", 4 * FREE + NOISE, tally)
+        if len(tally.problems) > 10:
+            break
+    return tally
+
+
+def test_a_few_hundred_hostile_files(seeds):
+    tally = fuzz(seeds, 400, 1)
+    assert tally.problems == []
+    assert tally.outcomes["refused"] > 150
+    assert tally.outcomes["decoded"] > 20
+
+
+@pytest.mark.slow
+@pytest.mark.fuzz
+@pytest.mark.timeout(3600)
+def test_many_hostile_files(seeds):
+    tally = fuzz(seeds, FUZZ_FILES, 2)
+    print(f"\n{dict(tally.outcomes)}; slowest {tally.slowest_s:.3f} s; growth {tally.largest_growth / 1e6:.1f} MB")
+    assert tally.problems == []
+
+
+def test_flipped_bytes_are_refused(seeds):
+    data, rng = seeds[3], np.random.default_rng(0)
+    for at in rng.integers(len(data), size=400).tolist():
+        damaged = bytearray(data)
+        damaged[at] ^= 1 << int(rng.integers(8))
+        with pytest.raises(BitstreamError):
+            file.decode(ContainerReader(bytes(damaged)))
+
+
+def test_every_length_is_refused(seeds):
+    data = seeds[1]
+    for length in np.random.default_rng(0).integers(len(data), size=300).tolist():
+        with pytest.raises(BitstreamError):
+            file.decode(ContainerReader(data[:length]))
+
+
+@pytest.mark.parametrize("rows", [2**31, 2**26, 2**20])
+def test_rows_that_bytes_cannot_hold_are_refused_at_once(seeds, rows):
+    parts = Parts.of(seeds[0])
+    parts.header["static"]["order"] = [[0, "base", rows], [0, "view", rows]]
+    data, tally = parts.join(), Tally()
+    began = time.perf_counter()
+    with pytest.raises(BitstreamError):
+        file.decode(ContainerReader(data))
+    assert time.perf_counter() - began < 1
+    attempt(lambda: decoded(data), "rows", NOISE, tally)
+    assert tally.problems == []
+
+
+def test_an_octree_of_many_nodes_and_few_splats_is_refused():
+    """All bits 1: more cells than announced splats can fill."""
+    stream = Writer()
+    stream.bits(np.full(200_000, 4095), np.ones(200_000, bool))
+    shares = Shares(np.full((16, 4), 4095), np.zeros((16, 39), np.int64))
+    scene = made_up(3)
+    parts = Parts.of(written(scene))
+    networks = dict(parts.sections)["networks"]
+    reader = file.ByteReader(networks)
+    Shares.unpack(reader)
+    rest = networks[len(networks) - reader.left :]
+    sections = {"networks": shares.pack() + rest, "packet.01": stream.finish(), "packet.02": b""}
+    parts.sections = list(sections.items())
+    static = parts.header["static"]
+    static["order"] = [[0, "base", 20_000], [0, "view", 20_000]]
+    static["cuts"] = np.cumsum([len(each) for each in sections.values()])[1:].tolist()
+    tally = Tally()
+    with pytest.raises(BitstreamError, match="octree has more"):
+        file.decode(ContainerReader(parts.join()))
+    attempt(lambda: decoded(parts.join()), "nodes", 100 << 20, tally)
+    assert tally.problems == []
+
+
+def test_largest_weights_of_the_context_still_add_up_exactly():
+    """Rows of weights 127 x 2^5 in every network stay below 2^53; finer exponents than 2^-12 are refused."""
+    context = some_networks().exact()
+    layers = tuple(
+        replace(layer, weights=np.full_like(layer.weights, 127), exponents=np.full_like(layer.exponents, 5))
+        for layer in context.layers
+    )
+    largest = file.PyramidContext(context.prior, layers)
+    data = written(replace(made_up(60), context=largest))
+    assert decoded(data) == "decoded"
+    fine = replace(context.layers[0], exponents=np.full_like(context.layers[0].exponents, -13))
+    with pytest.raises(BitstreamError, match="finer"):
+        file.PyramidContext.unpack(
+            file.ByteReader(file.PyramidContext(context.prior, (fine, *context.layers[1:])).pack())
+        )
