@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-import sys
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from forked_children import run_python
 
 
 @dataclass(frozen=True)
@@ -67,10 +68,7 @@ class Site:
     def _python(self, arguments: list[str], given: str = "", **env: str) -> subprocess.CompletedProcess[str]:
         path = os.pathsep.join([str(self.folder), *filter(None, [os.environ.get("PYTHONPATH")])])
         kept = {k: v for k, v in os.environ.items() if not k.startswith(("SW_", "_SW_"))}
-        return subprocess.run(
-            [sys.executable, *arguments], cwd=self.folder, env={**kept, "PYTHONPATH": path, **env}, input=given,
-            capture_output=True, text=True, timeout=1200, check=False,
-        )  # fmt: skip
+        return run_python(*arguments, cwd=self.folder, env={**kept, "PYTHONPATH": path, **env}, input=given)
 
     def listed(self, **env: str) -> Listed:
         """`sw list-plugins --json`."""
