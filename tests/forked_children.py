@@ -27,7 +27,10 @@ from typing import Any
 import splatwizard_core.runs.fresh
 
 MODULES = ("splatwizard_core.cli.fresh_child", "splatwizard_core")
-PLAIN = ("SW_", "SPLATWIZARD_", "PYTHONPATH", "PYTEST_", "COV_", "TMPDIR", "HOME", "XDG_", "TORCH_HOME", "COLUMNS")
+PLAIN = (
+    "SW_", "SPLATWIZARD_", "PYTHONPATH", "PYTEST_", "COV_", "TEST_", "TMPDIR", "HOME", "XDG_", "TORCH_HOME", "COLUMNS",
+    "PATH", "CXX",
+)  # fmt: skip
 """Variables that mean the same to a process that reads them late; any other difference needs a new interpreter."""
 
 

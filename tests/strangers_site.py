@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
+import sys
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -66,9 +68,24 @@ class Site:
         return [Done(*each) for each in json.loads(done.stdout)]
 
     def _python(self, arguments: list[str], given: str = "", **env: str) -> subprocess.CompletedProcess[str]:
+        return run_python(*arguments, cwd=self.folder, env=self._environment(env), input=given)
+
+    def _environment(self, more: Mapping[str, str]) -> dict[str, str]:
         path = os.pathsep.join([str(self.folder), *filter(None, [os.environ.get("PYTHONPATH")])])
         kept = {k: v for k, v in os.environ.items() if not k.startswith(("SW_", "_SW_"))}
-        return run_python(*arguments, cwd=self.folder, env={**kept, "PYTHONPATH": path, **env}, input=given)
+        return {**kept, "PYTHONPATH": path, **more}
+
+    def start(self, *arguments: str, **env: str) -> subprocess.Popen[str]:
+        """Start `sw ARGUMENTS` as a foreground process of a terminal would run: Ctrl-C (SIGINT) reaches it."""
+
+        def heed_interrupts() -> None:
+            # What a shell started in the background ignores, its children ignore too.
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+        return subprocess.Popen(
+            [sys.executable, "-m", "splatwizard_core", *arguments], cwd=self.folder, env=self._environment(env),
+            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, preexec_fn=heed_interrupts,
+        )  # fmt: skip
 
     def listed(self, **env: str) -> Listed:
         """`sw list-plugins --json`."""
