@@ -93,20 +93,12 @@ HOOKS = {
 def test_a_plugin_can_add_a_command_by_a_marked_function_alone(tmp_path):
     site = Site(tmp_path)
     for name, (options, hook) in HOOKS.items():
-        source = HELLO.format(options=options, hook=hook, name=name, module=f"sw_{name}")
-        site.install(f"sw-{name}", source)
-    site.install(
-        "sw-unmarked",
-        HELLO.format(options="", hook="register_commands", name="unmarked", module="sw_unmarked").replace(
-            "@hookimpl", ""
-        ),
-    )
-    site.install(
-        "sw-misspelt", HELLO.format(options="", hook="register_comands", name="misspelt", module="sw_misspelt")
-    )
-    shown, *said, unmarked, misspelt = site.sw_each(
-        [["--help"], *([name] for name in HOOKS), ["unmarked"], ["misspelt"]]
-    )
+        site.install(f"sw-{name}", HELLO.format(options=options, hook=hook, name=name, module=f"sw_{name}"))
+    source = HELLO.replace("@hookimpl", "").format(options="", hook="register_commands", name="unmarked", module="-")
+    site.install("sw-unmarked", source)
+    site.install("sw-misspelt", HELLO.format(options="", hook="register_comands", name="misspelt", module="-"))
+    words = [["--help"], *([name] for name in HOOKS), ["unmarked"], ["misspelt"]]
+    shown, *said, unmarked, misspelt = site.sw_each(words)
     for name, done in zip(HOOKS, said, strict=True):
         assert done.stdout == "hello from a plugin\n"
         assert re.search(rf"{name} +says hello", shown.stdout)
