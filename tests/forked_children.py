@@ -8,7 +8,7 @@ from the same server. A child that asks for what only a new interpreter gives (a
 seeds) gets one.
 
 Two failures stay unseen here: an import that only the server's own imports make good, and a crash while an interpreter
-ends. Tests with the fixture `new_interpreters` start what users start.
+ends. Inside `starting()` tests start what users start.
 """
 
 from __future__ import annotations

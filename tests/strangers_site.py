@@ -55,7 +55,7 @@ class Site:
 
     def sw(self, *arguments: object, check: bool = True, **env: str) -> subprocess.CompletedProcess[str]:
         """Run `sw ARGUMENTS`; AssertionError with its output if it fails or shows a traceback."""
-        done = self._python(["-m", "splatwizard_core", *map(str, arguments)], **env)
+        done = self.run("-m", "splatwizard_core", *map(str, arguments), **env)
         told = f"sw {' '.join(map(str, arguments))} exited {done.returncode}:\n{done.stdout}\n{done.stderr}"
         assert done.returncode == 0 or not check, told
         assert "Traceback" not in done.stderr, told
@@ -63,12 +63,15 @@ class Site:
 
     def sw_each(self, commands: Sequence[Sequence[str]]) -> list[Done]:
         """Run several commands one after the other in one process, which imports what they need once."""
-        done = self._python(["-c", EACH], json.dumps(commands))
+        done = self.run("-c", EACH, given=json.dumps(commands))
         assert done.returncode == 0, done.stderr
         return [Done(*each) for each in json.loads(done.stdout)]
 
-    def _python(self, arguments: list[str], given: str = "", **env: str) -> subprocess.CompletedProcess[str]:
-        return run_python(*arguments, cwd=self.folder, env=self._environment(env), input=given)
+    def run(
+        self, *arguments: str, given: str = "", cwd: Path | None = None, **env: str
+    ) -> subprocess.CompletedProcess[str]:
+        """Run Python, with its path, from its folder or another one."""
+        return run_python(*arguments, cwd=cwd or self.folder, env=self._environment(env), input=given)
 
     def _environment(self, more: Mapping[str, str]) -> dict[str, str]:
         path = os.pathsep.join([str(self.folder), *filter(None, [os.environ.get("PYTHONPATH")])])

@@ -383,7 +383,7 @@ def test_wrong_input(row: Row, things: Path, tmp_path: Path, surroundings, capsy
     assert tree(things, tmp_path) == before
 
 
-IN_A_PROCESS = ("rum", "run --method 3dsg", "run --scene {hollow}", "decode {cut.swz}")
+IN_A_PROCESS = ("rum", "decode {cut.swz}")
 
 
 @pytest.mark.parametrize("row", [row for row in ROWS if row.line in IN_A_PROCESS], ids=str)
