@@ -129,6 +129,7 @@ ROWS = [
     Row("run --scene {photos}", "holds pictures but no camera poses"),
     Row("train --scene ''", "--scene is empty"),
     Row("info ''", "PATH is empty"),
+    Row("info {notes.txt}", "no file that `sw info` can read: .swz, metrics.json, "),
     Row("run --scene demo:giant", "demo"),
     Row("run --scene colmap:{blender}", "cameras"),
     Row("run --scene {scene} --images images_3", "images_3"),

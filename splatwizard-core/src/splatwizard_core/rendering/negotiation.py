@@ -69,6 +69,7 @@ class NegotiatedRasterizer:
         """Names of the rasterizers that served a request; clear it to learn which ones serve from then on."""
         self._registry = plugins.rasterizers
         self._prefer = [self._registry.entry(name).name for name in prefer]
+        self._wanted = tuple(self._prefer)
         self._prefer += [self._registry.entry(name).name for name in suggested if name in self._registry]
         self._forbid = {self._registry.entry(name).name for name in forbid}
         forced = os.environ.get("SW_RASTERIZER")
@@ -79,6 +80,9 @@ class NegotiatedRasterizer:
         self._readable = [info for entry in self._registry if (info := self._read(entry)) is not None]
         self._usable = [info for info in self._readable if self._may_serve(info)]
         self._options = dict(options)
+        for info in self._readable:
+            if info.name in self._wanted and self.device.type not in info.devices:
+                _warn_once(f"'{info.name}', which raster.prefer names, does not draw on {self.device.type}")
         self._check_profile(self._options.get("profile"))
         self.info = RasterizerInfo(
             name="negotiated",
@@ -237,8 +241,10 @@ class NegotiatedRasterizer:
         for info in sorted((i for i in self._usable if _can_serve(i, wanted)), key=rank, reverse=True):
             reason = self._unavailable(info)
             if reason is None:
-                # A failed build is news; what cannot run here by nature only if a slow oracle is all that remains.
-                news = [w for name, w in passed_over.items() if name in self._failed or info.speed <= 0]
+                # A failed build is news, and so is what the user named; what cannot run here by nature only if a slow
+                # oracle is all that remains.
+                told = {*self._failed, *self._wanted}
+                news = [w for name, w in passed_over.items() if name in told or info.speed <= 0]
                 return info, news[0] if news else None
             passed_over[info.name] = reason
         raise self._nothing(wanted, passed_over)

@@ -6,6 +6,7 @@ import copy
 import functools
 import hashlib
 import json
+import logging
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ResolvedConfig", "apply_overrides", "parse_set", "rate_points", "read_config_file", "resolve"]
 
+log = logging.getLogger(__name__)
 RESERVED = ("method", "preset", "rate", "scene")
 SCENE_KEYS = tuple(SceneParams.model_fields)
 PRETRAINED = "pretrained."  # keys of the method whose trained scene a run starts from
@@ -315,7 +317,9 @@ def resolve(
         (str(config_file), flatten(method.Config, flatten(PipelineParams, tables))),
         ("--set", sets or {}),
     ):
-        layer = config.spelled(layer)
+        given_keys, layer = dict(layer), config.spelled(layer)
+        if source == "--set" or source == str(config_file):
+            _tell_older(method.Config, given_keys, layer, source)
         given: dict[type[Params], dict[str, Any]] = {method.Config: {}, PipelineParams: {}, SceneParams: {}}
         for key, value in layer.items():
             block = next((block for block in given if field_at(block, key) is not None), None)
@@ -345,6 +349,18 @@ def resolve(
         init, pretrained,
         check_settings(plugins.metrics, settings) if settings else {}, procedural,
     )  # fmt: skip
+
+
+def _tell_older(config: type[Params], given: Mapping[str, Any], today: Mapping[str, Any], source: str) -> None:
+    older = [key for key in given if key not in today and field_at(config, key) is None]
+    newer = ", ".join(key for key in today if key not in given) or "nothing"
+    if older:
+        _warn_once(f"{source}: {', '.join(older)} of release 0.2 is now {newer} (docs/migration.md)")
+
+
+@functools.cache
+def _warn_once(line: str) -> None:
+    log.warning(line)
 
 
 def _check_names(said: Mapping[str, str], config_file: str | Path | None, **asked: str | None) -> None:
