@@ -34,6 +34,7 @@ MODULES = {
     "fused.in_backward": "end_offer offer_update offered_update",
     "fused.photometric": "Padding photometric",
     "interrupt": "InterruptGuard",
+    "lock": "HeldError file_lock read_holder",
     "machine": "describe_machine",
     "memory": "MemoryMeter peak_rss_bytes reset_peak_rss rss_bytes synchronize",
     "module": "NativeModule",

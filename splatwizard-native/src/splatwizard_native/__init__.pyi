@@ -32,6 +32,9 @@ from splatwizard_native.fused.photometric import Padding as Padding
 from splatwizard_native.fused.photometric import photometric as photometric
 from splatwizard_native.interrupt import InterruptGuard as InterruptGuard
 from splatwizard_native.lazy_imports import lazy_exports as lazy_exports
+from splatwizard_native.lock import HeldError as HeldError
+from splatwizard_native.lock import file_lock as file_lock
+from splatwizard_native.lock import read_holder as read_holder
 from splatwizard_native.machine import describe_machine as describe_machine
 from splatwizard_native.memory import MemoryMeter as MemoryMeter
 from splatwizard_native.memory import peak_rss_bytes as peak_rss_bytes
