@@ -28,6 +28,7 @@ from scene import make_arrays, orbit_cameras
 from sw_gaussians.stage import ThreeDGSStage
 from torch.profiler import ProfilerActivity, profile
 
+from splatwizard_core.base.random_states import seeded
 from splatwizard_core.base.rng import Streams
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins.manager import load_plugins
@@ -39,7 +40,6 @@ from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.stage import StageContext
 from splatwizard_core.training.state import TrainingState
 from splatwizard_core.training.trainer import Trainer
-from splatwizard_native import seeded
 from sw_3dgs.config import ThreeDGSConfig
 
 TENSORS = ("means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats")

@@ -50,6 +50,7 @@ from step_parts import SECTION, kernel_times, longest_kernels, report
 from sw_anchors.fast import networks, replay, rows, sample_bits
 from torch.profiler import ProfilerActivity, profile, record_function
 
+from splatwizard_core.base.random_states import seeded
 from splatwizard_core.base.rng import Streams
 from splatwizard_core.gaussians.inputs import rgb_to_dc
 from splatwizard_core.gaussians.model import GaussianModel
@@ -65,7 +66,7 @@ from splatwizard_core.streams import stream
 from splatwizard_core.training.stage import StageContext
 from splatwizard_core.training.state import TrainingState
 from splatwizard_core.training.trainer import Trainer
-from splatwizard_native import seeded, work_time
+from splatwizard_native import work_time
 from sw_cat_3dgs.fast import plane_kernels, plane_sites
 
 # Attribute paths from the trainer -> the part of a step that its calls belong to; what a version lacks is left out.

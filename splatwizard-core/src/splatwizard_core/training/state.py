@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from splatwizard_core.base.random_states import capture_random_states, restore_random_states
 from splatwizard_core.base.rng import Streams
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.rendering.rasterizer import Rasterizer
@@ -19,7 +20,6 @@ from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.scheduler import Scheduler, build_schedulers
 from splatwizard_core.training.stage import CameraIterator, CameraSampler, Stage
 from splatwizard_core.training.tasks import SOURCES, TaskContext
-from splatwizard_native import capture_random_states, restore_random_states
 
 
 @dataclass(kw_only=True, repr=False)
