@@ -9,7 +9,7 @@ from importlib import resources
 from markupsafe import Markup
 
 from sw_report.charts import HEIGHT, STYLES, WIDTH
-from sw_report.looks import looks_of
+from sw_report.method_styles import styles_of
 from sw_report.plots import distortion_charts
 from sw_report.runs import Run
 
@@ -36,7 +36,7 @@ def rd_svg(runs: Sequence[Run], title: str) -> str | None:
 
     runs    of one scene under one protocol
     """
-    charts = distortion_charts(runs, looks_of(runs))
+    charts = distortion_charts(runs, styles_of(runs))
     if charts is None:
         return None
     width = 2 * MARGIN + len(charts.figures) * (WIDTH + GAP) - GAP

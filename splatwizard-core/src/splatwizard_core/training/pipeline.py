@@ -27,8 +27,8 @@ from splatwizard_core.training.checkpoint import (
     differences,
     normalised,
 )
-from splatwizard_core.training.figures import Provided, StagePlan, TrainingFigures
 from splatwizard_core.training.housekeeping import Evaluate, Housekeeping, OnStep
+from splatwizard_core.training.measurements import Provided, StagePlan, TrainingFigures
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.plan import plan_rows
 from splatwizard_core.training.scheduler import build_schedulers

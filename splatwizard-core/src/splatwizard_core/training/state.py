@@ -15,7 +15,7 @@ from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.rendering.rasterizer import Rasterizer
 from splatwizard_core.scene.scene import Scene
 from splatwizard_core.training.checkpoint import Checkpoint, normalised
-from splatwizard_core.training.figures import TrainingFigures
+from splatwizard_core.training.measurements import TrainingFigures
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.scheduler import Scheduler, build_schedulers
 from splatwizard_core.training.stage import CameraIterator, CameraSampler, Stage
