@@ -148,7 +148,7 @@ def measure(n: int, width: int, height: int, args: argparse.Namespace) -> None:
         for name in names:
             with setting(name):
                 least[name] = min(least[name], wall(trainers[name], args.steps, args.device))
-    print(f"{n:,} Gaussians, {width}x{height}, {100 * share:.0f} % visible in the first view, ms a step")
+    print(f"{n:,} Gaussians, {width}x{height}, {100 * share:.0f} % visible in the first view, ms per step")
     for name in names:
         print(f"  {name:14} wall {least[name]:6.3f}   {least[name] / least[names[0]]:5.2f} of {names[0]}")
     if args.device != "cuda":

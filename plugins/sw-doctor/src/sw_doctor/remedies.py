@@ -1,4 +1,4 @@
-"""What to do about a plugin that does not work, in one line."""
+"""Advice about a plugin that does not work, in one line."""
 
 from __future__ import annotations
 

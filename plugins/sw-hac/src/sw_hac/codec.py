@@ -87,7 +87,7 @@ def decode(reader: ContainerReader, plugins: PluginManager) -> DecodedAnchors:
 
 @dataclass(frozen=True)
 class HACHeader:
-    """Header values of a file: coder mode, base steps, sizes of anchors and networks; `grid_features` bits a vertex."""
+    """Header values of a file: coder mode, base steps, sizes of anchors, networks; `grid_features` bits per vertex."""
 
     mode: Mode
     base_steps: tuple[float, float, float]

@@ -34,7 +34,7 @@ def counts_anchors(run: Run) -> bool:
 
 
 def distortion_charts(runs: Sequence[Run], style_of: dict[str, int]) -> Charts | None:
-    """Quality against bytes, one chart a metric, one line a method."""
+    """Quality against bytes, one chart per metric, one line per method."""
     variants = variants_of(runs)
     figures = []
     for metric in drawn_metrics(runs):

@@ -32,7 +32,7 @@ text { fill: var(--muted); font: 11.5px ui-sans-serif, system-ui, "Segoe UI", Ro
 
 
 def rd_svg(runs: Sequence[Run], title: str) -> str | None:
-    """Quality against bytes, one chart a metric beside the other, one line a method; None if there is nothing to draw.
+    """Quality against bytes, one chart per metric beside the other, one line per method; None if nothing can be drawn.
 
     runs    of one scene under one protocol
     """
