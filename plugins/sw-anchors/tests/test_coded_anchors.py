@@ -10,7 +10,7 @@ from sw_anchors.coded_anchors import ENTROPY, FULL, QUANTIZED, CodedAnchors
 from sw_anchors.decoded_anchors import DecodedAnchors
 from sw_anchors.growth import adjust_anchors
 from sw_anchors.lattice import TOP, bounds_of, coded_positions, position_codes
-from sw_anchors.rate_model import AnchorContext, AnchorForecast, gaussian_rate
+from sw_anchors.rate_model import AnchorDistributions, AnchorForecast, gaussian_rate
 from sw_reference.rasterizer import ReferenceRasterizer
 from sw_reference.testing.raster_scenes import front_camera
 
@@ -216,7 +216,7 @@ class Older(Flat):
     def predict(self, rows):
         widths, n = self.shape.widths, len(rows)
         steps = self.log_steps.exp()
-        return AnchorContext(
+        return AnchorDistributions(
             tuple(torch.zeros(n, w) for w in widths),
             tuple(torch.ones(n, w) for w in widths),
             tuple(step.expand(n, 1) for step in steps),

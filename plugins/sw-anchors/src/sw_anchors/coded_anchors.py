@@ -20,7 +20,7 @@ from sw_anchors.noisy_values import FULL as FULL
 from sw_anchors.noisy_values import MASK_THRESHOLD, Noise, NoisyValues, draws, noisy_values
 from sw_anchors.noisy_values import QUANTIZED as QUANTIZED
 from sw_anchors.older_coded_anchors import PredictedRate
-from sw_anchors.rate_model import AnchorRate, Context, Floors, RateModel, Triple, triple
+from sw_anchors.rate_model import AnchorRate, Floors, RateInputs, RateModel, Triple, triple
 from sw_codecs.quantizers.multiples import nearest_index
 from sw_codecs.quantizers.straight_through import hard_mask
 
@@ -160,11 +160,11 @@ class CodedAnchors(AnchorModel):
         """Return the rate model, which predicts quantiser steps and distributions in training and for the file."""
         return PredictedRate(self)
 
-    def context_rows(self) -> Context:
+    def context_rows(self) -> RateInputs:
         """Return the inputs of the rate model, one row per anchor of the model."""
         return (torch.arange(self.num_rows, device=self.device),)
 
-    def context_of(self, rows: Tensor) -> Context:
+    def context_of(self, rows: Tensor) -> RateInputs:
         """Return the inputs of the rate model for the anchors `rows`."""
         return tuple(part.index_select(0, rows) for part in self.context_rows())
 

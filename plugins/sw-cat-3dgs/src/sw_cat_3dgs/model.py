@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import torch
 from sw_anchors.coded_anchors import CodedAnchors
-from sw_anchors.rate_model import Context
+from sw_anchors.rate_model import RateInputs
 from torch import Tensor
 
 from splatwizard_core.api import Camera, Rasterizer
@@ -66,7 +66,7 @@ class CatAnchors(CodedAnchors):
             kept = self._places = (key, self.context.places(codes, self.bounds))
         return kept[1]
 
-    def context_rows(self) -> Context:
+    def context_rows(self) -> RateInputs:
         """The places of the anchors in the triplane; their sites on the planes, where `fast` takes these."""
         triplane, places = self.context.triplane, self.places()
         return plane_sites.kept_sites(triplane, places) if plane_sites.fits(triplane) else (places,)

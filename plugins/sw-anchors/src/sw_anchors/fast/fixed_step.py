@@ -23,7 +23,7 @@ from sw_anchors.fast.seen_rows import SeenRows
 from sw_anchors.fast.spawn import visible_gaussians
 from sw_anchors.neural_gaussians import NeuralGaussians
 from sw_anchors.noisy_values import ENTROPY, MASK_THRESHOLD, QUANTIZED
-from sw_anchors.rate_model import AnchorForecast, AnchorRate, Context, RateModel
+from sw_anchors.rate_model import AnchorForecast, AnchorRate, RateInputs, RateModel
 from sw_anchors.shape import AnchorShape
 
 PARAMETERS = ("features", "log_scales", "offsets", "mask_logits")
@@ -174,7 +174,7 @@ def decode_rows(model: Model, at: FixedRows, pool: PoolRows | None) -> Found:
             forecast = model.rate_model.forecast(at.parts, drawn)
             steps = forecast.steps
         else:
-            both: Context = tuple(torch.cat(pair) for pair in zip(at.parts, pool.parts, strict=True))
+            both: RateInputs = tuple(torch.cat(pair) for pair in zip(at.parts, pool.parts, strict=True))
             forecast = model.rate_model.forecast(both, slice(capacity, None))
             steps = forecast.steps[:capacity]
     given = (at.parameters, at.weights, at.count, None if steps is None else noise, steps, MASK_THRESHOLD)
