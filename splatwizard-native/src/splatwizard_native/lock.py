@@ -9,9 +9,9 @@ import shlex
 import socket
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
 from datetime import datetime, timezone
 from pathlib import Path
+from typing import NamedTuple
 
 from splatwizard_native.errors import ForeseenError, NativeBuildError
 
@@ -19,8 +19,7 @@ POLL_SECONDS = 0.5
 COMMAND_CHARACTERS = 200  # of the holder's command that are kept
 
 
-@dataclass(frozen=True)
-class Holder:
+class Holder(NamedTuple):
     """The process that holds a lock file.
 
     since   ISO 8601, UTC
@@ -64,7 +63,7 @@ def file_lock(path: Path, *, timeout: float, say: Callable[[str], None]) -> Iter
                 raise HeldError(holder) from None
         before = read_holder(path)
         with contextlib.suppress(OSError):  # a full disk: the lock holds all the same, and reading needs no space
-            path.write_text(json.dumps(asdict(_myself())), encoding="utf-8")
+            path.write_text(json.dumps(_myself()._asdict()), encoding="utf-8")
         # The file stays, empty: removing it would let two processes lock two files of the same name.
         held.callback(os.truncate, path, 0)
         yield before
@@ -101,6 +100,4 @@ def read_holder(path: Path) -> Holder | None:
 def _myself() -> Holder:
     since = datetime.now(timezone.utc).isoformat(timespec="seconds")
     command = shlex.join([os.path.basename(sys.argv[0]) or "python", *sys.argv[1:]])
-    if len(command) > COMMAND_CHARACTERS:
-        command = f"{command[: COMMAND_CHARACTERS - 3]}..."
-    return Holder(os.getpid(), socket.gethostname(), since, command)
+    return Holder(os.getpid(), socket.gethostname(), since, command[:COMMAND_CHARACTERS])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import logging
 import os
 from collections.abc import Callable, Iterable, Mapping
@@ -13,6 +12,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+from splatwizard_core.base.warned import warn_once
 from splatwizard_core.errors import CapabilityError, ConfigError, PluginError
 from splatwizard_core.gaussians.inputs import GaussianInputs
 from splatwizard_core.plugins.catalogue import catalogue, package_of
@@ -82,7 +82,7 @@ class NegotiatedRasterizer:
         self._options = dict(options)
         for info in self._readable:
             if info.name in self._wanted and self.device.type not in info.devices:
-                _warn_once(f"'{info.name}', which raster.prefer names, does not draw on {self.device.type}")
+                warn_once(f"'{info.name}', which raster.prefer names, does not draw on {self.device.type}")
         self._check_profile(self._options.get("profile"))
         self.info = RasterizerInfo(
             name="negotiated",
@@ -155,7 +155,7 @@ class NegotiatedRasterizer:
             rasterizer = AdaptedRasterizer(rasterizer, missing)
             composing = f", composing {', '.join(sorted(missing))}"
         if passed_over is not None:
-            _warn_once(f"{passed_over}; rendering with '{best.name}' instead")
+            warn_once(f"{passed_over}; rendering with '{best.name}' instead")
         log.info("%s on %s: rasterizer '%s' (%s)%s", asked, self.device, best.name, best.exactness, composing)
         self.choices[asked] = best.name
         self._chosen[wanted] = rasterizer
@@ -205,7 +205,7 @@ class NegotiatedRasterizer:
         except PluginError as error:
             if entry.name in (self._forced, *self._prefer):
                 raise
-            _warn_once(f"{error}: it is not used")
+            warn_once(f"{error}: it is not used")
             return None
 
     def _check_profile(self, name: str | None) -> None:
@@ -296,9 +296,3 @@ def _how_to_get_one() -> str:
     if not packages:
         return "`sw list-plugins` shows whether one is broken or left out"
     return f"pip install {packages[0]}" if len(packages) == 1 else f"install one of {', '.join(packages)} with pip"
-
-
-@functools.cache
-def _warn_once(message: str) -> None:
-    """Once per process: several rasterizers may share one kernel module."""
-    log.warning("%s", message)

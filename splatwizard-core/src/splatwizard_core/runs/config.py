@@ -6,7 +6,6 @@ import copy
 import functools
 import hashlib
 import json
-import logging
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard
 
 from splatwizard_core.base.toml_file import read_toml
+from splatwizard_core.base.warned import warn_once
 from splatwizard_core.errors import ConfigError, PluginError
 from splatwizard_core.evaluation.metrics import MetricSettings, check_settings
 from splatwizard_core.plugins.manager import PluginManager, load_plugins
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
 __all__ = ["ResolvedConfig", "apply_overrides", "parse_set", "rate_points", "read_config_file", "resolve"]
 
-log = logging.getLogger(__name__)
 RESERVED = ("method", "preset", "rate", "scene")
 SCENE_KEYS = tuple(SceneParams.model_fields)
 PRETRAINED = "pretrained."  # keys of the method whose trained scene a run starts from
@@ -355,12 +354,7 @@ def _tell_older(config: type[Params], given: Mapping[str, Any], today: Mapping[s
     older = [key for key in given if key not in today and field_at(config, key) is None]
     newer = ", ".join(key for key in today if key not in given) or "nothing"
     if older:
-        _warn_once(f"{source}: {', '.join(older)} of release 0.2 is now {newer} (docs/migration.md)")
-
-
-@functools.cache
-def _warn_once(line: str) -> None:
-    log.warning(line)
+        warn_once(f"{source}: {', '.join(older)} of release 0.2 is now {newer} (docs/migration.md)")
 
 
 def _check_names(said: Mapping[str, str], config_file: str | Path | None, **asked: str | None) -> None:
