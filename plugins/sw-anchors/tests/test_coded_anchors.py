@@ -133,8 +133,10 @@ def test_each_phase_moves_values_by_its_own_step():
             assert ("rate" in a.extras) == (phase == ENTROPY and training)
 
 
-def test_noise_of_the_second_phase_has_its_own_factor():
-    model, rows = make(n=400, noise_factor=1.1), torch.arange(400)
+def test_noise_of_the_second_phase_has_steps_of_its_own(monkeypatch):
+    model, rows = make(n=400), torch.arange(400)
+    steps = model.noise_steps(model.features)
+    monkeypatch.setattr(model, "noise_steps", lambda like: 1.1 * steps)
     model.phase = QUANTIZED
     moved = (model.attributes(rows).features - model.features).detach().abs().max()
     assert 0.5 < float(moved) <= 0.55

@@ -59,7 +59,6 @@ class CodedAnchors(AnchorModel):
         *,
         margin: Margin = "none",
         base_steps: tuple[float, float, float] = (1.0, 0.001, 0.2),
-        noise_factor: float = 1.0,
         sample: float = 0.05,
         smallest_probability: float = 1e-6,
         scale_floor: float = 0.0,
@@ -68,7 +67,6 @@ class CodedAnchors(AnchorModel):
         """Initialise like AnchorModel, which gets `kwargs`.
 
         margin          of the bounds, see `lattice.bounds_of`
-        noise_factor    multiplies the base steps in the phase QUANTIZED
         sample          share of the anchors whose rate is computed
         smallest_probability, scale_floor   floors of the rate in training, see `rate_model.Floors`
         """
@@ -79,7 +77,7 @@ class CodedAnchors(AnchorModel):
         self.phase = FULL
         self.noise: torch.Generator | None = None
         self.margin: Margin = margin
-        self.base_steps, self.noise_factor = base_steps, noise_factor
+        self.base_steps = base_steps
         self.sample, self.smallest_probability = sample, smallest_probability
         self.scale_floor = scale_floor
         self._lattice: tuple[tuple[Any, ...], Tensor, Tensor] | None = None
@@ -181,8 +179,7 @@ class CodedAnchors(AnchorModel):
         if self.phase == FULL:
             values = self._values(rows, None)
         elif self.phase == QUANTIZED:
-            steps = self.base_steps_like(self.features)[None] * self.noise_factor
-            values = self._values(rows, Noise(steps, self._draw_noise(rows)))
+            values = self._values(rows, Noise(self.noise_steps(self.features), self._draw_noise(rows)))
         elif self.RATE_OF == "visible":
             values, rate["rate"] = self._with_rate_of_visible(rows)
         else:
@@ -226,6 +223,10 @@ class CodedAnchors(AnchorModel):
     @property
     def _tables(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         return self.features, self.log_scales, self.offsets, self.mask_logits
+
+    def noise_steps(self, like: Tensor) -> Tensor:
+        """Return the steps [1,3] of the noise in the phase QUANTIZED: the base steps."""
+        return self.base_steps_like(like)[None]
 
     def base_steps_like(self, like: Tensor) -> Tensor:
         """Return base steps [3] with device and dtype of `like`, cached to avoid a host-device wait per step."""

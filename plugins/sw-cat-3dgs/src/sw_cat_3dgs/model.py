@@ -33,7 +33,7 @@ class CatAnchors(CodedAnchors):
 
     def __init__(self, *tensors: Tensor, context: CatContext, view_factor: float = 1.0, **kwargs: Any) -> None:
         """Tensors and other arguments as of CodedAnchors."""
-        super().__init__(*tensors, base_steps=context.shape.base_steps, noise_factor=STEP_OFFSET, **kwargs)
+        super().__init__(*tensors, base_steps=context.shape.base_steps, **kwargs)
         self.context = context.to(self.anchors.device)
         self.view_factor = view_factor
         self.views_stale = True
@@ -44,6 +44,10 @@ class CatAnchors(CodedAnchors):
     def __getstate__(self) -> dict[str, Any]:
         """A copy works out anew where its anchors lie."""
         return {**self.__dict__, "_places": None}
+
+    def noise_steps(self, like: Tensor) -> Tensor:
+        """Return the base steps times the factor of a predicted step whose logit is 0."""
+        return super().noise_steps(like) * STEP_OFFSET
 
     def mask_weights(self) -> Tensor:
         return self.view_weights[:, None]
