@@ -23,7 +23,8 @@ from splatwizard_core.api import (
     ShapeError,
 )
 from sw_rasterizers import plugin
-from sw_rasterizers.ops import Call, Flag, camera_numbers, rasterize, visible_radii
+from sw_rasterizers.call import Call, Flag, camera_numbers
+from sw_rasterizers.ops import rasterize, visible_radii
 from sw_rasterizers.scoring import Totals, add_scores, check_count
 
 CUDA_CHANNELS = 8
