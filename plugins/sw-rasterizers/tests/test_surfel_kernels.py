@@ -292,9 +292,9 @@ def test_the_ops_read_no_further_than_there_is():
         (g.scales, g.quats[:, :3].contiguous(), "quats must be a contiguous"),
     ):
         with pytest.raises(RuntimeError, match=told):
-            cpu.visible_radii(call, {"means": g.means, "scales": scales, "quats": quats}, call.flags)
+            cpu.visible_radii(call, {"means": g.means, "scales": scales, "quats": quats})
     with pytest.raises(RuntimeError, match="image of 0 x 50"):
-        cpu.visible_radii(replace(call, width=0), {"means": g.means, "scales": g.scales, "quats": g.quats}, call.flags)
+        cpu.visible_radii(replace(call, width=0), {"means": g.means, "scales": g.scales, "quats": g.quats})
     with pytest.raises(ShapeError):
         SurfelRasterizer().visible_filter(replace(g, quats=g.quats[:, :3]), cam)
     with pytest.raises(CapabilityError, match="SURFEL"):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import os
 from collections.abc import Collection
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
@@ -19,7 +18,14 @@ MOST_PAIRS = 1 << 27
 """Pairs of a splat and a tile that a call may have: four times those of the largest real scenes."""
 LIMIT = "SPLATWIZARD_MAX_TILE_PAIRS"
 
-Tensors = dict[str, Tensor | None]
+INVERSE_DEPTH, ACCUMULATED_DEPTH, MEDIAN_DEPTH, ALPHA_MAP, SAVE, WITH_MAPS = map(int, (
+    Flag.INVERSE_DEPTH, Flag.ACCUMULATED_DEPTH, Flag.MEDIAN_DEPTH, Flag.ALPHA_MAP, Flag.SAVE, Flag.WITH_MAPS
+))  # fmt: skip
+"""As numbers, which Python combines several times as fast."""
+
+Arguments = dict[str, Any]
+Tensors = dict[str, Any]
+"""Tensors or None, by the names that the operations have for them."""
 
 
 class Kept(NamedTuple):
@@ -36,15 +42,14 @@ class Kept(NamedTuple):
     sum_bytes: int
 
 
-@dataclass
-class Drawn:
-    """image [C,H,W], radii [N] int32, alpha and median depth [0 or 1,H,W], maps of surfels [0 or 7,H,W]."""
+class Drawn(NamedTuple):
+    """image [C,H,W], radii [N] int32; where they are asked for alpha, median depth [1,H,W], maps of surfels [7,H,W]."""
 
     image: Tensor
     radii: Tensor
-    alpha: Tensor
-    median: Tensor
-    maps: Tensor
+    alpha: Tensor | None
+    median: Tensor | None
+    maps: Tensor | None
     kept: Kept
 
 
@@ -57,42 +62,64 @@ class Projected(NamedTuple):
     found: face.project_call
 
 
+class Picture:
+    """A view and what it is drawn with, as the operations take it; holds no tensor to differentiate by.
+
+    channels    of the image: colours, depths, features
+    """
+
+    def __init__(self, call: Call, tensors: Tensors, flags: int) -> None:
+        colors, features, background = tensors["colors"], tensors.get("features"), call.background
+        self.call, self.flags = call, flags
+        self.colors = 3 if colors is None else colors.shape[1]
+        depths = bool(flags & INVERSE_DEPTH) + bool(flags & ACCUMULATED_DEPTH)
+        self.channels = self.colors + depths + (0 if features is None else features.shape[1])
+        self.size = call.height, call.width
+        self.view: Arguments = {"camera": call.camera, "width": call.width, "height": call.height, "flags": flags}
+        self.how: Arguments = {
+            "sh_degree": call.sh_degree, "scale_modifier": call.scale_modifier, "eps2d": call.eps2d
+        }  # fmt: skip
+        behind = "background" if background is None or background.dim() == 1 else "backdrop"
+        self.canvas: Arguments = {"channels": self.channels, "color_channels": self.colors, behind: background}
+
+    def empty_image(self, dtype: torch.dtype) -> Tensor:
+        """Return an image without its pixels."""
+        return empty((self.channels, *self.size), dtype)
+
+
 class _Listed:
     """How many pairs calls had of late: a guess at how many the next one has."""
 
     recent = 0
 
 
-def draw(call: Call, tensors: Tensors, flags: Flag) -> Drawn:
+def draw(picture: Picture, tensors: Tensors) -> Drawn:
     """Draw one view; `tensors` by the names of INPUTS, contiguous. Fills counts and seconds of the call.
 
     Raises RuntimeError for tensors that do not fit together, and for more pairs than are allowed.
     """
-    projected = project(call, tensors, flags, training=Flag.SAVE in flags)
-    means, found = tensors["means"], projected.found
+    call, flags, means = picture.call, picture.flags, tensors["means"]
     assert means is not None
-    size, dtype = (call.height, call.width), means.dtype
-    image = empty((channels_of(tensors, flags), *size), dtype)
-    alpha = empty((int(Flag.ALPHA_MAP in flags), *size), dtype)
-    median = empty((int(Flag.MEDIAN_DEPTH in flags), *size), dtype)
-    maps = empty((7 if Flag.WITH_MAPS in flags else 0, *size), dtype)
-    made, lists = make_lists(call, tensors, flags, projected, image=image, alpha=alpha, median=median, maps=maps)
+    projected = project(picture, tensors, training=bool(flags & SAVE))
+    found, dtype = projected.found, means.dtype
+    image = picture.empty_image(dtype)
+    alpha = empty((1, *picture.size), dtype) if flags & ALPHA_MAP else None
+    median = empty((1, *picture.size), dtype) if flags & MEDIAN_DEPTH else None
+    maps = empty((7, *picture.size), dtype) if flags & WITH_MAPS else None
+    made, lists = make_lists(picture, projected, image, alpha=alpha, median=median, maps=maps)
     call.counts = [found.seen, found.pairs, made.evaluated, made.blended, found.invalid]
     seconds = found.project_seconds, made.sort_seconds, made.bin_seconds, made.blend_seconds
     call.seconds.update(zip(FORWARD_STAGES, seconds, strict=True))
-    return Drawn(
-        image, projected.radii, alpha, median, maps, Kept(projected.splats, lists, found.pairs, found.sum_bytes)
-    )
+    kept = Kept(projected.splats, lists, found.pairs, found.sum_bytes)
+    return Drawn(image, projected.radii, alpha, median, maps, kept)
 
 
-def project(call: Call, tensors: Tensors, flags: Flag, *, training: bool = False) -> Projected:
+def project(picture: Picture, tensors: Tensors, *, training: bool = False) -> Projected:
     """Project the Gaussians of one view. In training half as many pairs are allowed. Raises as `draw`."""
-    means = tensors["means"]
+    call, means = picture.call, tensors["means"]
     assert means is not None
-    count, colors = len(means), _colors(tensors)
-    bytes_of = _splat_bytes(
-        means.element_size(), count, int(flags), channels_of(tensors, flags), colors, call.sh_degree
-    )
+    count, colors = len(means), picture.colors
+    bytes_of = _splat_bytes(means.element_size(), count, picture.flags, picture.channels, colors, call.sh_degree)
     splats, radii = empty((bytes_of,), torch.uint8), torch.empty(count, dtype=torch.int32)
     most = _most_pairs() // (2 if training else 1)
     room = min(most, max(4 * count + (1 << 14), _Listed.recent + _Listed.recent // 4))
@@ -100,12 +127,12 @@ def project(call: Call, tensors: Tensors, flags: Flag, *, training: bool = False
         tiles = empty((room,), torch.int32)
         found = face.project(
             **tensors, geom_indices=call.geom_indices, visible=call.visible, count=count, color_channels=colors,
-            splats=splats, tiles=tiles, radii=radii, **_view(call, flags), **_how(call),
+            splats=splats, tiles=tiles, radii=radii, **picture.view, **picture.how,
         )  # fmt: skip
         if found.listed > most:
             raise RuntimeError(
                 f"sw_rasterizers: {found.listed} splat-tile pairs are more than {most}: draw fewer Gaussians or a "
-                f"smaller image, or set {LIMIT} (12 bytes each, 70 in training, which takes half as many)"
+                f"smaller image, or set {LIMIT} (13 bytes each, 70 in training, which takes half as many)"
             )
         _Listed.recent = max(found.listed, _Listed.recent - _Listed.recent // 64)
         if found.listed <= room:
@@ -114,77 +141,50 @@ def project(call: Call, tensors: Tensors, flags: Flag, *, training: bool = False
 
 
 def make_lists(
-    call: Call, tensors: Tensors, flags: Flag, projected: Projected, image: Tensor | None = None, **maps: Tensor
+    picture: Picture, projected: Projected, image: Tensor | None, **maps: Any
 ) -> tuple[face.draw_call, Tensor]:
     """List the splats of each tile and draw them, where there is an image; return what was told, and the lists."""
-    found, means = projected.found, tensors["means"]
-    assert means is not None
+    splats, tiles, radii, found = projected
     lists = empty((found.list_bytes,), torch.uint8)
     made = face.draw(
-        real_bytes=means.element_size(), splats=projected.splats, tiles=projected.tiles, count=len(means),
-        used=found.used, pairs=found.pairs, lists=lists, image=image, **_view(call, flags),
-        **canvas(call, tensors, flags), **{name: x for name, x in maps.items() if x.numel()},
+        real_bytes=found.real_bytes, splats=splats, tiles=tiles, count=len(radii), used=found.used, pairs=found.pairs,
+        lists=lists, image=image, **maps, **picture.view, **picture.canvas,
     )  # fmt: skip
     return made, lists
 
 
 def draw_backward(
-    call: Call, tensors: Tensors, flags: Flag, kept: Kept, by: Tensors, wanted: Collection[str]
+    picture: Picture, tensors: Tensors, kept: Kept, by: Tensors, wanted: Collection[str]
 ) -> dict[str, Tensor]:
     """Return the gradients that are wanted, by name of the input, or "grad2d" and "absgrad2d" [N,2].
 
     by      gradients of "image", and of "alpha", "median", "maps" or None; contiguous
     """
-    means = tensors["means"]
+    call, means = picture.call, tensors["means"]
     assert means is not None
-    made = {name: empty(x.shape, x.dtype) for name, x in tensors.items() if name in wanted and x is not None}
+    made: Tensors = {name: empty(x.shape, x.dtype) for name, x in tensors.items() if name in wanted and x is not None}
     made |= {name: empty((len(means), 2), means.dtype) for name in ("grad2d", "absgrad2d") if name in wanted}
     found = face.draw_backward(
         **tensors, geom_indices=call.geom_indices, visible=call.visible, splats=kept.splats, lists=kept.lists,
         pairs=kept.pairs, sums=empty((kept.sum_bytes,), torch.uint8),
         **{f"by_{name}": x for name, x in by.items()}, **{f"of_{name}": x for name, x in made.items()},
-        **_view(call, flags), **_how(call), **canvas(call, tensors, flags),
+        **picture.view, **picture.how, **picture.canvas,
     )  # fmt: skip
     call.seconds.update(zip(BACKWARD_STAGES, (found.blend_seconds, found.project_seconds), strict=True))
     return made
 
 
-def visible_radii(call: Call, geometry: Tensors, flags: Flag) -> Tensor:
+def visible_radii(call: Call, geometry: Tensors) -> Tensor:
     """Return radii [N] int32, px, from means, scales, quats, cov3d and scale_factors; 0 = culled."""
     means = geometry["means"]
     assert means is not None
     radii = torch.empty(len(means), dtype=torch.int32)
     face.visible_radii(
-        **geometry, geom_indices=call.geom_indices, visible=call.visible, radii=radii,
-        scale_modifier=call.scale_modifier, eps2d=call.eps2d, **_view(call, flags),
+        **geometry, geom_indices=call.geom_indices, visible=call.visible, radii=radii, camera=call.camera,
+        width=call.width, height=call.height, flags=int(call.flags), scale_modifier=call.scale_modifier,
+        eps2d=call.eps2d,
     )  # fmt: skip
     return radii
-
-
-def canvas(call: Call, tensors: Tensors, flags: Flag) -> dict[str, Any]:
-    """Return the arguments of an operation that say what a picture consists of."""
-    behind = "background" if call.background is None or call.background.dim() == 1 else "backdrop"
-    return {"channels": channels_of(tensors, flags), "color_channels": _colors(tensors), behind: call.background}
-
-
-def channels_of(tensors: Tensors, flags: Flag) -> int:
-    """Return the channels of the image: colours, depths, features."""
-    features = tensors.get("features")
-    depths = (Flag.INVERSE_DEPTH in flags) + (Flag.ACCUMULATED_DEPTH in flags)
-    return _colors(tensors) + depths + (0 if features is None else features.shape[1])
-
-
-def _colors(tensors: Tensors) -> int:
-    colors = tensors["colors"]
-    return 3 if colors is None else colors.shape[1]
-
-
-def _view(call: Call, flags: Flag) -> dict[str, Any]:
-    return {"camera": call.camera, "width": call.width, "height": call.height, "flags": int(flags)}
-
-
-def _how(call: Call) -> dict[str, Any]:
-    return {"sh_degree": call.sh_degree, "scale_modifier": call.scale_modifier, "eps2d": call.eps2d}
 
 
 @functools.lru_cache(maxsize=64)

@@ -19,13 +19,14 @@ UPDATED = ("sh_dc", "sh_rest")
 
 
 class _Rasterize(torch.autograd.Function):
-    """On the CPU: (call, dummy, *INPUTS) -> image [C,H,W], radii [N] int32, alpha and median depth [0 or 1,H,W]."""
+    """On the CPU: (call, dummy, *INPUTS) -> image [C,H,W], radii [N] int32, alpha and median depth [1,H,W] or None."""
 
     @staticmethod
-    def forward(ctx: Any, call: Call, dummy: Tensor | None, *inputs: Tensor | None) -> tuple[Tensor, ...]:
+    def forward(ctx: Any, call: Call, dummy: Tensor | None, *inputs: Tensor | None) -> tuple[Tensor | None, ...]:
         tensors = [None if x is None else x.detach().contiguous() for x in inputs]
-        drawn = cpu.draw(call, dict(zip(INPUTS, tensors, strict=True)), call.flags)
-        ctx.call = call
+        named = dict(zip(INPUTS, tensors, strict=True))
+        ctx.picture = cpu.Picture(call, named, int(call.flags))
+        drawn = cpu.draw(ctx.picture, named)
         ctx.mark_non_differentiable(drawn.radii)
         ctx.set_materialize_grads(False)
         # All state goes through save_for_backward, so that it is freed with the graph even if the result lives on.
@@ -36,18 +37,19 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        image, _, alpha, median = (None if x is None or x.numel() == 0 else x.contiguous() for x in grads)
-        call: Call = ctx.call
+        image, _, alpha, median = (None if x is None else x.contiguous() for x in grads)
+        picture: cpu.Picture = ctx.picture
+        call = picture.call
         *stored, splats, lists = ctx.saved_tensors
         tensors = dict(zip(INPUTS, stored, strict=True))
         if image is None:
-            image = stored[0].new_zeros(cpu.channels_of(tensors, call.flags), call.height, call.width)
+            image = stored[0].new_zeros(picture.channels, *picture.size)
         statistics = {"grad2d": call.grad2d, "absgrad2d": call.absgrad2d}
         wanted = {name for name, asked in zip(INPUTS, ctx.needs_input_grad[2:], strict=True) if asked}
         wanted |= {name for name, buffer in statistics.items() if buffer is not None}
         found = cpu.draw_backward(
-            call, tensors, call.flags, cpu.Kept(splats, lists, *ctx.sizes),
-            {"image": image, "alpha": alpha, "median": median}, wanted,
+            picture, tensors, cpu.Kept(splats, lists, *ctx.sizes), {"image": image, "alpha": alpha, "median": median},
+            wanted,
         )  # fmt: skip
         for name, buffer in statistics.items():
             if buffer is not None:
@@ -108,11 +110,11 @@ def backward_seconds() -> dict[str, float]:
     return dict(zip(BACKWARD_STAGES, torch.ops.sw_rasterizers.backward_seconds(), strict=False))
 
 
-def rasterize(call: Call, tensors: dict[str, Tensor | None]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def rasterize(call: Call, tensors: dict[str, Tensor | None]) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
     """Render one view. Differentiable with respect to every tensor of INPUTS; all of one dtype and device.
 
     Returns the channels [C + depths + E, H, W] (colours over the background, then inverse and accumulated depth if
-    flagged, then features), radii [N] int32, alpha [1,H,W] or [0,H,W], median depth likewise.
+    flagged, then features), radii [N] int32, alpha [1,H,W], median depth likewise, if flagged.
     State for the backward pass is kept only if something needs a gradient.
     """
     inputs = [tensors.get(name) for name in INPUTS]
@@ -124,7 +126,7 @@ def rasterize(call: Call, tensors: dict[str, Tensor | None]) -> tuple[Tensor, Te
         plain = {name: None if x is None else x.detach().contiguous() for name, x in zip(INPUTS, inputs, strict=True)}
         if means.is_cuda:
             return _draw_plainly_on_cuda(call, plain)
-        drawn = cpu.draw(call, plain, call.flags)
+        drawn = cpu.draw(cpu.Picture(call, plain, int(call.flags)), plain)
         return drawn.image, drawn.radii, drawn.alpha, drawn.median
     if means.is_cuda:
         return _draw_on_cuda(call, tensors)
@@ -154,4 +156,4 @@ def visible_radii(
     *given, rows, mask = geometry
     call = Call(camera_numbers(cam), cam.width, cam.height, 0, 1.0, 0.3, Flag(0), geom_indices=rows, visible=mask)
     names = "means", "scales", "quats", "cov3d", "scale_factors"
-    return cpu.visible_radii(call, dict(zip(names, given, strict=True)), Flag(0))
+    return cpu.visible_radii(call, dict(zip(names, given, strict=True)))

@@ -8,6 +8,7 @@ from torch import Tensor
 from splatwizard_core.api import AccumOutput, CapabilityError, GaussianInputs, RasterOptions, ScoreSpec
 from sw_rasterizers import cpu, face
 from sw_rasterizers.call import Call, Flag
+from sw_rasterizers.memory import empty
 from sw_rasterizers.native import cuda_ops
 
 KINDS = (
@@ -77,38 +78,36 @@ def add_scores(g: GaussianInputs, call: Call, opt: RasterOptions, totals: Totals
     )  # fmt: skip
 
 
-def _add_on_cpu(tensors: dict[str, Tensor | None], call: Call, specs: tuple[ScoreSpec, ...], totals: Totals) -> None:
+def _add_on_cpu(tensors: cpu.Tensors, call: Call, specs: tuple[ScoreSpec, ...], totals: Totals) -> None:
     flags = call.flags | Flag.SAVE
     if totals.fisher is None:
         flags |= Flag.FOR_SCORES
-    projected = cpu.project(call, tensors, flags)
+    picture = cpu.Picture(call, tensors, int(flags))
+    projected = cpu.project(picture, tensors)
     means, pairs = tensors["means"], projected.found.pairs
     assert means is not None
     if pairs == 0:
         return
     kinds = [KINDS.index(spec.kind) for spec in specs]
     sensitive = [i for i, kind in enumerate(kinds) if kind >= SENSITIVE]
-    image = None
-    if sensitive or totals.fisher is not None:  # what they need of each pixel comes with the picture
-        image = cpu.empty((cpu.channels_of(tensors, flags), call.height, call.width), means.dtype)
-    _, lists = cpu.make_lists(call, tensors, flags, projected, image)
-    view = {
-        "splats": projected.splats, "lists": lists, "pairs": pairs, "count": len(means), "flags": int(flags),
-        "camera": call.camera, "width": call.width, "height": call.height, **cpu.canvas(call, tensors, flags),
-    }  # fmt: skip
+    # What these need of each pixel comes with the picture.
+    image = picture.empty_image(means.dtype) if sensitive or totals.fisher is not None else None
+    _, lists = cpu.make_lists(picture, projected, image)
+    view = {"splats": projected.splats, "lists": lists, "pairs": pairs, **picture.view, **picture.canvas}
     weights = [given.detach().to(means).contiguous() if (given := _weight(s)) is not None else None for s in specs]
     for family in ([i for i in range(len(specs)) if i not in sensitive], sensitive):
         if family:
             face.add_scores(
-                **view, kinds=[kinds[i] for i in family], tested=[specs[i].rule == "tested" for i in family],
+                **view, count=len(means), kinds=[kinds[i] for i in family],
+                tested=[specs[i].rule == "tested" for i in family],
                 gammas=[float(specs[i].gamma) for i in family], weights=[weights[i] for i in family],
-                totals=[totals.scores[i] for i in family], sums=cpu.empty((pairs, len(family)), means.dtype),
+                totals=[totals.scores[i] for i in family], sums=empty((pairs, len(family)), means.dtype),
             )  # fmt: skip
     if totals.fisher is not None:
         face.add_fisher(
             **view, means=means, scales=tensors["scales"], quats=tensors["quats"], sh_degree=call.sh_degree,
-            scale_modifier=call.scale_modifier, eps2d=call.eps2d, blocks=totals.fisher,
-            sums=cpu.empty((pairs, FISHER_SUMS), means.dtype),
+            scale_modifier=call.scale_modifier, eps2d=call.eps2d, count=len(means), blocks=totals.fisher,
+            sums=empty((pairs, FISHER_SUMS), means.dtype),
         )  # fmt: skip
 
 

@@ -60,13 +60,14 @@ class _SharedColors(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         tensors, segments, gradient = ctx.saved_tensors, ctx.segments, gradient.contiguous()
-        means, dc, _ = tensors
+        means, dc, codebook = tensors
         if means.is_cuda:
             of_codebook, of_dc, of_means = cuda_ops().shared_colors_backward(
                 *tensors, *ctx.arguments, segments.order, segments.offsets, gradient
             )
             return of_codebook, of_dc if dc is not None else None, of_means, None, None, None, None
-        of_means, of_dc, of_codebook = (None if x is None else empty(tuple(x.shape), x.dtype) for x in tensors)
+        of_means, of_codebook = (empty(tuple(x.shape), x.dtype) for x in (means, codebook))
+        of_dc = None if dc is None else empty(tuple(dc.shape), dc.dtype)
         face.shade_shared_backward(
             **_shared(ctx, tensors), order=segments.order, offsets=segments.offsets, by_colors=gradient,
             passed=empty(tuple(means.shape), means.dtype), of_codebook=of_codebook, of_means=of_means, of_dc=of_dc,
@@ -74,7 +75,7 @@ class _SharedColors(torch.autograd.Function):
         return of_codebook, of_dc, of_means, None, None, None, None
 
 
-def _shared(ctx: Any, tensors: Sequence[Tensor]) -> dict[str, Any]:
+def _shared(ctx: Any, tensors: Sequence[Tensor | None]) -> dict[str, Any]:
     (means, dc, codebook), (rows, center, degree, clamp) = tensors, ctx.arguments
     return {
         "means": means,

@@ -87,8 +87,9 @@ class StandardRasterizer:
             depth["accumulated"] = image[at : at + 1]
             at += 1
         if "expected" in opt.depth:
+            assert alpha is not None
             depth["expected"] = depth["accumulated"] / alpha.clamp(min=1e-10)
-        if "median" in opt.depth:
+        if median is not None and "median" in opt.depth:
             depth["median"] = median
         visible, pairs, evaluated, blended, invalid = call.counts
         return RenderResult(

@@ -105,7 +105,7 @@ class SurfelRasterizer:
             found: Tensor = cuda_ops().visible_surfel_radii(*geometry, visible, camera, cam.width, cam.height)
             return found
         call = Call(camera, cam.width, cam.height, 0, 1.0, 0.0, Flag.SURFELS, visible=visible)
-        return cpu.visible_radii(call, dict(zip(("means", "scales", "quats"), geometry, strict=True)), call.flags)
+        return cpu.visible_radii(call, dict(zip(("means", "scales", "quats"), geometry, strict=True)))
 
     @torch.no_grad()
     def accumulate(self, g: GaussianInputs, cams: Iterable[Camera], opt: RasterOptions) -> AccumOutput:
@@ -147,10 +147,10 @@ def _as_bytes(mask: Tensor | None) -> Tensor | None:
 
 
 class _DrawSurfels(torch.autograd.Function):
-    """(call, dummy, *INPUTS) -> image [3,H,W], radii [N] int32, alpha [0 or 1,H,W], maps [0 or 7,H,W]."""
+    """(call, dummy, *INPUTS) -> image [3,H,W], radii [N] int32, alpha [1,H,W] or None, maps [7,H,W] or None."""
 
     @staticmethod
-    def forward(ctx: Any, call: Call, dummy: Tensor | None, *inputs: Tensor | None) -> tuple[Tensor, ...]:
+    def forward(ctx: Any, call: Call, dummy: Tensor | None, *inputs: Tensor | None) -> tuple[Tensor | None, ...]:
         tensors = [None if x is None else x.detach().contiguous() for x in inputs]
         on_cuda = tensors[0] is not None and tensors[0].is_cuda
         ctx.call = call
@@ -161,7 +161,9 @@ class _DrawSurfels(torch.autograd.Function):
             )
             call.seconds.update(zip(FORWARD_STAGES, seconds, strict=False))  # only if counting
         else:
-            drawn = cpu.draw(call, _named(tensors), call.flags | Flag.SURFELS)
+            named = _named(tensors)
+            ctx.picture = cpu.Picture(call, named, int(call.flags | Flag.SURFELS))
+            drawn = cpu.draw(ctx.picture, named)
             image, radii, alpha, maps = drawn.image, drawn.radii, drawn.alpha, drawn.maps
             saved, ctx.sizes = drawn.kept[:2], drawn.kept[2:]
         ctx.mark_non_differentiable(radii)
@@ -188,7 +190,7 @@ class _DrawSurfels(torch.autograd.Function):
         else:
             names = {name for name, want in zip(INPUTS, asked, strict=True) if want}
             gradients = cpu.draw_backward(
-                call, _named(tensors), call.flags | Flag.SURFELS, cpu.Kept(*saved, *ctx.sizes),
+                ctx.picture, _named(tensors), cpu.Kept(*saved, *ctx.sizes),
                 {"image": image, "alpha": alpha, "maps": maps}, names | ({"grad2d"} if call.grad2d else set()),
             )  # fmt: skip
         if call.grad2d is not None:
