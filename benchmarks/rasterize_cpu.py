@@ -22,7 +22,7 @@ import numpy as np
 import torch
 
 from splatwizard_core.api import Rasterizer, RasterOptions
-from splatwizard_native.operations import operations
+from splatwizard_native import operations
 from sw_rasterizers import face, native
 from sw_rasterizers.call import BACKWARD_STAGES, FORWARD_STAGES
 from sw_rasterizers.standard import StandardRasterizer
