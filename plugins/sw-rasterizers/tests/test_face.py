@@ -85,7 +85,7 @@ def test_a_guess_at_the_pairs_that_was_too_small_changes_nothing(surfels, thread
 
     def draw(recent: int) -> tuple[torch.Tensor, int]:
         calls.clear()
-        cpu._Listed.recent = recent
+        monkeypatch.setattr(cpu._Listed, "recent", recent)
         return rasterizer.render(g, cam, RasterOptions()).image, len(calls)
 
     torch.set_num_threads(threads)
