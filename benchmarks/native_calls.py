@@ -22,6 +22,11 @@ HERE = Path(__file__).resolve().parents[1]
 
 def cases() -> Iterator[tuple[str, Callable[[], object]]]:
     """Name and call of each case; what checkouts share is used alone."""
+    yield from training_cases()
+    yield from exact_cases()
+
+
+def training_cases() -> Iterator[tuple[str, Callable[[], object]]]:
     import torch
 
     from splatwizard_native import AdamUpdate, adam_steps, photometric
@@ -43,6 +48,42 @@ def cases() -> Iterator[tuple[str, Callable[[], object]]]:
             photometric(image, target, 0.2)[0].backward()
 
         yield f"photometric {width} x {height}, forward and backward", loss
+
+
+def exact_cases() -> Iterator[tuple[str, Callable[[], object]]]:
+    import numpy as np
+    import torch
+
+    from sw_cat_3dgs.triplane import Triplane
+    from sw_codecs.context.integer_mlp import IntegerMlp
+    from sw_codecs.entropy import exact_streams
+    from sw_codecs.entropy.lattice import lattice
+
+    draw = np.random.default_rng(0)
+    layers = [(draw.normal(0, 0.1, (o, i)).astype("f4"), np.zeros(o, "f4")) for i, o in ((48, 64), (64, 64))]
+    network = IntegerMlp(layers)
+    planes = [torch.from_numpy(draw.integers(-50, 50, (3, 24, size, size))) for size in (32, 64)]
+    look_up = Triplane.exact_lookup(planes)
+    for rows in (1, 100, 10_000):
+        mean, scale = draw.integers(-(1 << 16), 1 << 16, (rows, 10)), draw.integers(0, 1 << 15, (rows, 10))
+        step = draw.integers(64, 16384, (rows, 1))
+        centre, number = lattice(mean, scale, step)
+        symbols = (centre + draw.normal(0, 3, len(centre)).round()).astype(np.int32)
+        data = exact_streams.encode("gaussian", symbols, centre, number)
+        inputs = torch.from_numpy(draw.integers(-5000, 5000, (rows, 48)))
+        places = torch.from_numpy(draw.integers(0, 1 << 20, (rows, 3)))
+        yield f"lattice of {rows:,} x 10", lambda m=mean, s=scale, t=step: lattice(m, s, t)
+        at = (centre, number)
+        yield (
+            f"exact streams, {10 * rows:,} symbols, encode",
+            lambda s=symbols, at=at: exact_streams.encode("gaussian", s, *at),
+        )
+        yield (
+            f"exact streams, {10 * rows:,} symbols, decode",
+            lambda d=data, at=at: exact_streams.decode("gaussian", d, *at),
+        )
+        yield f"integer network, {rows:,} rows", lambda x=inputs: network(x)
+        yield f"integer triplane, {rows:,} places", lambda x=places: look_up(x)
 
 
 def measure(only: str) -> dict[str, float]:

@@ -27,7 +27,6 @@ MODULES = {
     "lock": "HeldError file_lock read_holder",
     "memory": "MemoryMeter peak_rss_bytes reset_peak_rss rss_bytes synchronize",
     "module": "NativeModule",
-    "operations": "operations",
     "progress": "Bar duration track",
     "settings": "cache_root fast_enabled",
     "strict_json": "dump_strict json_reason load_strict",

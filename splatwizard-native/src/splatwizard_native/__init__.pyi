@@ -40,7 +40,6 @@ from splatwizard_native.memory import reset_peak_rss as reset_peak_rss
 from splatwizard_native.memory import rss_bytes as rss_bytes
 from splatwizard_native.memory import synchronize as synchronize
 from splatwizard_native.module import NativeModule as NativeModule
-from splatwizard_native.operations import operations as operations
 from splatwizard_native.progress import Bar as Bar
 from splatwizard_native.progress import duration as duration
 from splatwizard_native.progress import track as track

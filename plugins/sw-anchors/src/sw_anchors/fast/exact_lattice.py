@@ -11,6 +11,7 @@ from torch import Tensor
 from splatwizard_native import fast_enabled
 from sw_anchors.row_parts import MAX_EXACT_NUMBERS, parts_of
 from sw_anchors.shape import GROUPS, AnchorShape
+from sw_codecs import exact_operations
 from sw_codecs.context.integer_mlp import IntegerMlp, for_kernel
 from sw_codecs.entropy.exact_tables import exact_tables
 from sw_codecs.entropy.rows import RowLattice
@@ -36,11 +37,12 @@ def on_lattice(
     number = [torch.empty(n, c, dtype=torch.int16) for c in columns]
     steps = torch.empty(n, len(columns), dtype=torch.int64)
     multipliers = torch.from_numpy(exact_tables().multipliers + of.step_offset)
-    thresholds, weights, start = torch.from_numpy(exact_tables().thresholds), of.network.tensors(), 0
+    thresholds, start = torch.from_numpy(exact_tables().thresholds), 0
+    layers = of.network.flat(), of.network.widths
     for part in parts_of(places, width, MAX_EXACT_NUMBERS) if n else ():
         at = slice(start, start + len(part))
         into = [c[at] for c in centre], [c[at] for c in number], steps[at]
-        if torch.ops.sw_codecs_exact.forecast([for_kernel(features(part))], weights, multipliers, thresholds, *into):
+        if exact_operations.forecast([for_kernel(features(part))], *layers, multipliers, thresholds, *into):
             return None  # out of range: whoever codes the numbers says so
         start += len(part)
     return {group: RowLattice(centre[i], number[i], steps[:, i : i + 1]) for i, group in enumerate(GROUPS)}

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from splatwizard_core.api import BitstreamError
+from sw_codecs import exact_operations
 from sw_codecs.bits import checksum
 from sw_codecs.bits.packing import ByteReader
 from sw_codecs.coders import model_spec
@@ -135,7 +136,7 @@ class RangeCoder(ChunkedCoder):
 def _decode_bits(payload: memoryview, count: int, share: float) -> np.ndarray:
     words = torch.from_numpy(np.frombuffer(payload, np.uint8).copy())
     zeros = int((1 - share) * ((1 << 24) - 2)) + 1  # docs/bitstream.md, tables of counts as models
-    bits, status = torch.ops.sw_codecs_exact.decode_bits(words, zeros, count)
+    bits, status = exact_operations.decode_bits(words, zeros, count)
     if status:
         raise BitstreamError("the coded words are damaged")
     found: np.ndarray = bits.numpy()

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.api import BitstreamError
+from sw_codecs import exact_operations
 from sw_codecs.bits.packing import ByteReader, write_varint
 from sw_codecs.coders.arithmetic import RangeCoder
 from sw_codecs.coders.model_spec import K_LIMIT, Gaussian
@@ -91,7 +92,7 @@ class ConditionalGaussian:
             except ValueError as error:
                 raise BitstreamError(str(error)) from error
             symbols = torch.from_numpy(self._exact.decode_at(data, *where))
-            found: Tensor = torch.ops.sw_codecs_exact.put_values(symbols, there, step.contiguous(), values)
+            found: Tensor = exact_operations.put_values(symbols, there, step.contiguous(), values)
             return found
         found = torch.from_numpy(self.decode(data, context, present))
         values.copy_(found * step)

@@ -21,6 +21,7 @@ import numpy as np
 import torch
 
 from splatwizard_core.api import BitstreamError
+from sw_codecs import exact_operations
 from sw_codecs.bits import checksum, exp_golomb
 from sw_codecs.bits.packing import ByteReader, write_varint
 from sw_codecs.coders.symbol_stream import check_again, guarded
@@ -63,7 +64,7 @@ class _Rows:
         """Range-coded words of entries [n]: 0 .. 2 W, or the escape."""
         kernel = self._kernel()
         if kernel is not None:
-            words = torch.ops.sw_codecs_exact.encode_mixtures(*kernel, torch.from_numpy(entries.astype(np.int32)))
+            words = exact_operations.encode_mixtures(*kernel, torch.from_numpy(entries.astype(np.int32)))
             return bytes(words.numpy().tobytes())
         coder = constriction.stream.queue.RangeEncoder()
         with guarded(ValueError, "entropy coding"):
@@ -76,7 +77,7 @@ class _Rows:
         kernel = self._kernel()
         if kernel is not None:
             data = torch.from_numpy(np.frombuffer(words, np.uint8).copy())
-            entries, status = torch.ops.sw_codecs_exact.decode_mixtures(*kernel, data)
+            entries, status = exact_operations.decode_mixtures(*kernel, data)
             if status:
                 raise BitstreamError("coded words are damaged")
             return entries.numpy().astype(np.int64)
@@ -285,7 +286,7 @@ def _kernel_rows(parts: list[np.ndarray], shape: tuple[int, ...]) -> _Rows | Non
     if [each.shape for each in parts] != [shape] * 5 + [(shape[0], 1)]:
         return None
     tables = exact_tables()
-    *rows, status = torch.ops.sw_codecs_exact.mixture_rows(
+    *rows, status = exact_operations.mixture_rows(
         [_tensor(each) for each in parts], torch.from_numpy(tables.multipliers), torch.from_numpy(tables.thresholds),
         _summed_tables()[3], torch.from_numpy(WIDTHS),
     )  # fmt: skip

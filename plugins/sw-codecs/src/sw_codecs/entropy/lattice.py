@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sw_codecs import exact_operations
 from sw_codecs.entropy.exact_streams import SYMBOL_LIMIT
 from sw_codecs.entropy.exact_tables import FRACTIONS, exact_tables
 from sw_codecs.exact_native import EXACT
@@ -38,7 +39,7 @@ def lattice(
     full = arrays[0].shape
     fits = len(full) == 2 and [each.shape for each in arrays[1:]] == [full, (full[0], 1)]
     if fits and arrays[0].size and EXACT.try_load():
-        centre, number, status = torch.ops.sw_codecs_exact.lattice(
+        centre, number, status = exact_operations.lattice(
             *map(_tensor, arrays),
             None if there is None else torch.from_numpy(there),
             torch.from_numpy(exact_tables().thresholds),

@@ -19,6 +19,7 @@ import numpy.typing as npt
 import torch
 
 from splatwizard_core.api import BitstreamError
+from sw_codecs import exact_operations
 from sw_codecs.bits import checksum
 from sw_codecs.bits.packing import ByteReader, pack_fixed, packed_size, unpack_fixed, write_varint
 from sw_codecs.coders.count_tables import code_counts, count_codes, pack_tables, table_bits, unpack_tables
@@ -145,9 +146,7 @@ def _decode_levels(words: memoryview, tables: np.ndarray, crc: int, limit: int) 
     """Nodes int64 below the last level; `tables` [levels, 4, 255] counts, `limit` the most nodes of a level."""
     if len(words) % 4 == 0 and has_exact():
         coded = torch.from_numpy(np.frombuffer(words, np.uint8).copy())
-        nodes, occupancies, sizes, status = torch.ops.sw_codecs_exact.decode_octree(
-            coded, torch.from_numpy(tables), limit
-        )
+        nodes, occupancies, sizes, status = exact_operations.decode_octree(coded, torch.from_numpy(tables), limit)
         if status == BEYOND_LIMIT:
             _refuse_nodes(int((sizes > 0).sum()) - 1, limit)
         counts = sizes.tolist()
