@@ -24,6 +24,7 @@ def cases() -> Iterator[tuple[str, Callable[[], object]]]:
     """Name and call of each case; what checkouts share is used alone."""
     yield from training_cases()
     yield from exact_cases()
+    yield from codec_cases()
 
 
 def training_cases() -> Iterator[tuple[str, Callable[[], object]]]:
@@ -84,6 +85,34 @@ def exact_cases() -> Iterator[tuple[str, Callable[[], object]]]:
         )
         yield f"integer network, {rows:,} rows", lambda x=inputs: network(x)
         yield f"integer triplane, {rows:,} places", lambda x=places: look_up(x)
+
+
+def codec_cases() -> Iterator[tuple[str, Callable[[], object]]]:
+    import numpy as np
+    import torch
+
+    from sw_codecs.codebooks.fast.boxes import search_by_boxes
+    from sw_codecs.coders.huffman import HuffmanCoder
+    from sw_codecs.coders.model_spec import Table
+    from sw_hac.mixed_grid import MixedHashGrid
+
+    generator = torch.Generator().manual_seed(0)
+    grid = MixedHashGrid((18, 33, 59), (130, 258), features=4, log2_space=13, generator=generator)
+    draw = np.random.default_rng(0)
+    entries = torch.rand(4096, 3, generator=generator)
+    for rows in (1, 100, 20_000):
+        x = torch.rand(rows, 3, generator=generator)
+
+        def sample(x: torch.Tensor = x) -> None:
+            grid.with_bits(x)[0].sum().backward()
+
+        yield f"signs of {rows:,} places, forward and backward", sample
+        search = search_by_boxes(x, entries)
+        if search is not None:
+            yield f"nearest entries of {rows:,} rows", lambda x=x, search=search: search(x, 0)
+        spec = Table(np.array([5, 3, 2, 1]))
+        data = HuffmanCoder().encode(draw.integers(0, 4, rows), spec)
+        yield f"{rows:,} Huffman codes, decode", lambda d=data, n=rows, spec=spec: HuffmanCoder().decode(d, n, spec)
 
 
 def measure(only: str) -> dict[str, float]:

@@ -97,6 +97,8 @@ def test_a_header_is_read_by_lines():
     assert by_name["seen"].out
     with pytest.raises(ValueError, match=r"struct sum_call: 'some_type x;' is no field"):
         read_structs(HEADER.replace("double factor;", "some_type x;"))
+    with pytest.raises(ValueError, match=r"struct sum_call: 'size' is a field of the head"):
+        read_structs("typedef struct {\n  int64_t size;\n} sum_call;\n")
 
 
 @needs_compiler
