@@ -94,8 +94,10 @@ def codec_cases() -> Iterator[tuple[str, Callable[[], object]]]:
     from sw_codecs.codebooks.fast.boxes import search_by_boxes
     from sw_codecs.coders.huffman import HuffmanCoder
     from sw_codecs.coders.model_spec import Table
+    from sw_codecs.native import CODECS
     from sw_hac.mixed_grid import MixedHashGrid
 
+    CODECS.load()
     generator = torch.Generator().manual_seed(0)
     grid = MixedHashGrid((18, 33, 59), (130, 258), features=4, log2_space=13, generator=generator)
     draw = np.random.default_rng(0)
