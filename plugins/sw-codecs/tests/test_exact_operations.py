@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from sw_codecs import exact_operations
 from sw_codecs.entropy.exact_streams import share_tables
 from sw_codecs.exact_native import EXACT
+from sw_codecs.fast import exact_operations
 
 pytestmark = pytest.mark.skipif(EXACT.available() is not None, reason=str(EXACT.available()))
 

@@ -7,6 +7,7 @@ from splatwizard_core.base.random_states import seeded
 from splatwizard_core.plugins import load_plugins
 from sw_codecs import kernel_operations
 from sw_codecs.exact_native import EXACT
+from sw_codecs.fast import kernel_operations
 from sw_codecs.native import CODECS
 from sw_codecs.testing import check_context_model
 from sw_hac.fast import sign_lookup

@@ -15,6 +15,7 @@ MODULES = {
         "FULL CompilerMissingError DeviceMemoryError DiskFullError ForeseenError NativeBuildError out_of_memory "
         "shortened"
     ),
+    "face_operations": "operations",
     "files": (
         "TEMPORARY bytes_with_named file_sha256 naming_full_disk new_folder remove_folder replacing scratch_folder "
         "sweep write_atomic write_json"

@@ -22,11 +22,11 @@ from torch import Tensor
 from splatwizard_core.api import BitstreamError
 from sw_cat_3dgs.plane_fields import Field, PlaneModel, Shape, lattice_of, predicted
 from sw_cat_3dgs.stream_lanes import LaneReader, LaneWriter
-from sw_codecs import exact_operations
 from sw_codecs.bits import checksum
 from sw_codecs.bits.packing import ByteReader, write_varint
 from sw_codecs.entropy import exact_streams
 from sw_codecs.exact_native import EXACT
+from sw_codecs.fast import exact_operations
 
 SMALLEST_STREAM = 16_384
 """Integers that a stream has on average, if it could have more: it costs some eight bytes."""

@@ -14,8 +14,8 @@ from torch import Tensor, nn
 from torch.nn.functional import grid_sample
 
 from sw_cat_3dgs.principal_frame import UNIT
-from sw_codecs import exact_operations
 from sw_codecs.exact_native import EXACT
+from sw_codecs.fast import exact_operations
 from sw_codecs.quantizers.straight_through import straight_through
 
 PAIRS = ((0, 1), (0, 2), (1, 2))

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from splatwizard_core.errors import ShapeError
-from sw_codecs import kernel_operations
 from sw_codecs.codebooks import batches
 from sw_codecs.codebooks import nearest as search
 from sw_codecs.codebooks.fast import boxes as search_boxes
@@ -15,6 +14,7 @@ from sw_codecs.codebooks.kmeans import kmeans
 from sw_codecs.codebooks.nearest import nearest
 from sw_codecs.codebooks.relocation import relocate
 from sw_codecs.codebooks.weighted_rows import draw, gather
+from sw_codecs.fast import kernel_operations
 from sw_codecs.native import CODECS
 from sw_codecs.quantizers.vector_quantizer import VectorQuantizer
 

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from splatwizard_core.api import BitstreamError
-from sw_codecs import kernel_operations
 from sw_codecs.coders import huffman
 from sw_codecs.coders.arithmetic import HEADER
 from sw_codecs.coders.huffman import HuffmanCoder
 from sw_codecs.coders.model_spec import Table, Tables
+from sw_codecs.fast import kernel_operations
 from sw_codecs.native import CODECS
 
 pytestmark = pytest.mark.skipif(CODECS.available() is not None, reason=str(CODECS.available()))

@@ -10,6 +10,7 @@ from sw_codecs import kernel_operations
 from sw_codecs.context.fast import grid_lookup
 from sw_codecs.context.fast.grid_lookup import fits
 from sw_codecs.context.hash_grid import HashGrid
+from sw_codecs.fast import kernel_operations
 from sw_codecs.native import CODECS
 
 needs_kernels = pytest.mark.skipif(CODECS.available() is not None, reason=str(CODECS.available()))

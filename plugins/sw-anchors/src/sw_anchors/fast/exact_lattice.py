@@ -11,11 +11,11 @@ from torch import Tensor
 from splatwizard_native import fast_enabled
 from sw_anchors.row_parts import MAX_EXACT_NUMBERS, parts_of
 from sw_anchors.shape import GROUPS, AnchorShape
-from sw_codecs import exact_operations
 from sw_codecs.context.integer_mlp import IntegerMlp, for_kernel
 from sw_codecs.entropy.exact_tables import exact_tables
 from sw_codecs.entropy.rows import RowLattice
 from sw_codecs.exact_native import EXACT
+from sw_codecs.fast import exact_operations
 
 
 class Network(Protocol):

@@ -17,7 +17,7 @@ from splatwizard_native import fast_enabled
 from sw_cat_3dgs.fast.plane_kernels import fit_kernels, sampled, sampled_backward
 from sw_cat_3dgs.principal_frame import UNIT
 from sw_cat_3dgs.triplane import GAIN, PAIRS, Triplane
-from sw_codecs import kernel_operations
+from sw_codecs.fast import kernel_operations
 from sw_codecs.native import CODECS
 
 MOST_SCALES = 8

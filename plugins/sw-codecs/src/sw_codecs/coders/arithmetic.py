@@ -15,7 +15,6 @@ import numpy as np
 import torch
 
 from splatwizard_core.api import BitstreamError
-from sw_codecs import exact_operations
 from sw_codecs.bits import checksum
 from sw_codecs.bits.packing import ByteReader
 from sw_codecs.coders import model_spec
@@ -31,6 +30,7 @@ from sw_codecs.coders.model_spec import (
 )
 from sw_codecs.coders.symbol_stream import SymbolReader, SymbolWriter, check_again
 from sw_codecs.exact_native import has_exact
+from sw_codecs.fast import exact_operations
 
 CHUNK = 1 << 20
 HEADER = struct.Struct("<IiiII")

@@ -10,10 +10,10 @@ import torch
 
 from splatwizard_core.api import BitstreamError
 from splatwizard_native import NativeBuildError
-from sw_codecs import kernel_operations
 from sw_codecs.coders.arithmetic import ChunkedCoder
 from sw_codecs.coders.model_spec import Gaussian, Laplace, ModelSpec, Table, Tables
 from sw_codecs.coders.symbol_stream import guarded
+from sw_codecs.fast import kernel_operations
 from sw_codecs.native import CODECS
 
 MAX_TABLES = 4096  # distinct parameter pairs that may be turned into tables

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor, nn
 
 from splatwizard_core.api import BitstreamError
-from sw_codecs import exact_operations
 from sw_codecs.exact_native import EXACT
+from sw_codecs.fast import exact_operations
 
 FRACTION = 12
 ACTIVATION_LIMIT = 1 << 20  # 256 in units of 1

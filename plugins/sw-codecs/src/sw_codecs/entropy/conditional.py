@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.api import BitstreamError
-from sw_codecs import exact_operations
 from sw_codecs.bits.packing import ByteReader, write_varint
 from sw_codecs.coders.arithmetic import RangeCoder
 from sw_codecs.coders.model_spec import K_LIMIT, Gaussian
@@ -25,6 +24,7 @@ from sw_codecs.entropy.lattice import lattice
 from sw_codecs.entropy.rates import gaussian_bits
 from sw_codecs.entropy.rows import Numbers, RowContext, RowLattice
 from sw_codecs.exact_native import EXACT
+from sw_codecs.fast import exact_operations
 
 BLOCK_SYMBOLS = 1 << 20
 FLOAT_LATTICE = 16  # means and deviations in steps are rounded to 1/16

@@ -21,7 +21,6 @@ import numpy as np
 import torch
 
 from splatwizard_core.api import BitstreamError
-from sw_codecs import exact_operations
 from sw_codecs.bits import checksum, exp_golomb
 from sw_codecs.bits.packing import ByteReader, write_varint
 from sw_codecs.coders.symbol_stream import check_again, guarded
@@ -32,6 +31,7 @@ from sw_codecs.entropy.lattice import _tensor
 from sw_codecs.entropy.rates import gaussian_mass
 from sw_codecs.entropy.rows import Numbers, RowMixture
 from sw_codecs.exact_native import EXACT
+from sw_codecs.fast import exact_operations
 
 WIDTHS = np.array([4, 6, 8, 12, 16, 24, 32, 48, 64, 128, 256])
 """Half-widths of the windows that are coded without an escape."""

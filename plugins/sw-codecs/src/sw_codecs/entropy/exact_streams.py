@@ -22,12 +22,12 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.api import BitstreamError
-from sw_codecs import exact_operations
 from sw_codecs.bits import checksum, exp_golomb
 from sw_codecs.bits.packing import ByteReader, write_varint
 from sw_codecs.coders.symbol_stream import check_again, guarded
 from sw_codecs.entropy.exact_tables import FRACTIONS, Family, exact_tables
 from sw_codecs.exact_native import EXACT
+from sw_codecs.fast import exact_operations
 
 VERSION = 2
 STREAM = 1 << 16

@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sw_codecs import exact_operations
 from sw_codecs.entropy.exact_streams import SYMBOL_LIMIT
 from sw_codecs.entropy.exact_tables import FRACTIONS, exact_tables
 from sw_codecs.exact_native import EXACT
+from sw_codecs.fast import exact_operations
 
 UNIT = 4096  # 12 fractional bits
 PARAMETER_LIMIT = 1 << 48  # shifts and products below stay within 63 bits

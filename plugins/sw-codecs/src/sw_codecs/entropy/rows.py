@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sw_codecs import exact_operations
+from sw_codecs.fast import exact_operations
 
 Numbers = np.ndarray | Tensor
 

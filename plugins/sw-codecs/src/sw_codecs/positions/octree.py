@@ -19,13 +19,13 @@ import numpy.typing as npt
 import torch
 
 from splatwizard_core.api import BitstreamError
-from sw_codecs import exact_operations
 from sw_codecs.bits import checksum
 from sw_codecs.bits.packing import ByteReader, pack_fixed, packed_size, unpack_fixed, write_varint
 from sw_codecs.coders.count_tables import code_counts, count_codes, pack_tables, table_bits, unpack_tables
 from sw_codecs.coders.model_spec import Tables
 from sw_codecs.coders.symbol_stream import SymbolReader, SymbolWriter
 from sw_codecs.exact_native import has_exact
+from sw_codecs.fast import exact_operations
 from sw_codecs.positions import morton
 from sw_codecs.positions.duplicates import decode_duplicates, encode_duplicates, without_duplicates
 from sw_codecs.positions.ordering import spatial_order

@@ -10,11 +10,11 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from splatwizard_native import fast_enabled
-from sw_codecs import kernel_operations
 from sw_codecs.context.fast.grid_lookup import MAX_FEATURES, levels_of
 from sw_codecs.context.fast.ordered_sums import largest_for_sums
 from sw_codecs.context.hash_grid import HashGrid
-from sw_codecs.kernel_operations import MAX_LEVELS, Levels
+from sw_codecs.fast import kernel_operations
+from sw_codecs.fast.kernel_operations import MAX_LEVELS, Levels
 from sw_codecs.native import CODECS
 
 Parts = Sequence[tuple[tuple[int, ...], HashGrid]]

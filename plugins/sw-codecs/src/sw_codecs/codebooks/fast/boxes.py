@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from splatwizard_native import fast_enabled
-from sw_codecs import kernel_operations
+from sw_codecs.fast import kernel_operations
 from sw_codecs.native import CODECS
 
 WORTH_BOXES = 1 << 22

@@ -14,9 +14,9 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from splatwizard_native import fast_enabled
-from sw_codecs import kernel_operations
 from sw_codecs.context.fast.ordered_sums import largest_for_sums
-from sw_codecs.kernel_operations import MAX_LEVELS, Levels
+from sw_codecs.fast import kernel_operations
+from sw_codecs.fast.kernel_operations import MAX_LEVELS, Levels
 from sw_codecs.native import CODECS
 
 MAX_FEATURES = 8

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from splatwizard_native import fast_enabled
-from sw_codecs import exact_operations
 from sw_codecs.exact_native import EXACT
+from sw_codecs.fast import exact_operations
 
 MAX_FEATURES = 16
 """Signs of an entry, one bit each."""

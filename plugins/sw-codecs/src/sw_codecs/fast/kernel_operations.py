@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd.graph import increment_version
 
-from sw_codecs import face
+from sw_codecs.fast import face
 
 Levels = tuple[list[float], list[int], list[int], list[int], int]
 

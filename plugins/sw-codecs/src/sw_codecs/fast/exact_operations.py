@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sw_codecs import exact_face as face
+from sw_codecs.fast import exact_face as face
 
 STREAM = 1 << 16
 
