@@ -189,15 +189,15 @@ class NativeModule:
         return None
 
     def state(self) -> dict[str, Any]:
-        """Facts for `sw doctor`: state (prebuilt, cached, damaged, not built), path, target (cpu, cuda).
+        """Facts for `sw doctor`: state (prebuilt, built, damaged, reference), path, target (cpu, cuda).
 
         damaged: there is a library for this machine and these sources, but not the one that the build wrote.
         """
         path = self._session.loaded or next(self._existing(), None)
         if path is not None:
-            state = "prebuilt" if path.parent == self.prebuilt_folder else "cached"
+            state = "prebuilt" if path.parent == self.prebuilt_folder else "built"
         else:
-            state = "damaged" if any(library.exists() for library in self._places()) else "not built"
+            state = "damaged" if any(library.exists() for library in self._places()) else "reference"
         cuda = self._with_cuda() if path is None else bool(architectures_of(path))
         return {"state": state, "path": None if path is None else str(path), "target": "cuda" if cuda else "cpu"}
 
