@@ -2,7 +2,7 @@
 
     python tools/build_wheels.py [--out dist] [--machine aarch64] [sw-codecs ...]
 
-Needs hatchling, the sources of the packages on the path, and a C++ compiler ($CXX): no torch. A wheel with kernels is
+Needs hatchling, filelock and a C++ compiler ($CXX): no torch. A wheel with kernels is
 `py3-none-manylinux_2_N_<machine>`, N the newest glibc that its libraries ask for. For an older N, or another kind of
 machine, take zig (`pip install ziglang`), which brings its own C library:
 
@@ -94,6 +94,7 @@ def main() -> None:
     parser.add_argument("--machine", choices=("x86_64", "aarch64"), default=platform.machine())
     parser.add_argument("--libraries", action="store_true", help="compile into the packages' sources, build no wheel")
     arguments = parser.parse_args()
+    sys.path[:0] = [str(package / "src") for package in packages([])]
     for package in packages(arguments.packages):
         if arguments.libraries:
             for path in compiled(package, arguments.machine, package / "src"):
