@@ -114,7 +114,7 @@ def test_the_longest_chain_of_imports_stays_short():
     # Plain tools are left out: whoever imports their names need not know their inside.
     inside = {each for each in module_graph() if each.startswith(("splatwizard_native.", "splatwizard_core.base."))}
     chain = longest_chain({module: uses - inside for module, uses in module_graph().items()})
-    assert len(chain) <= 16, " -> ".join(chain)
+    assert len(chain) <= 17, " -> ".join(chain)
 
 
 def test_the_base_imports_nothing_of_ours():
