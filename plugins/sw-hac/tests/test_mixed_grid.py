@@ -5,7 +5,6 @@ import torch
 
 from splatwizard_core.base.random_states import seeded
 from splatwizard_core.plugins import load_plugins
-from sw_codecs import kernel_operations
 from sw_codecs.exact_native import EXACT
 from sw_codecs.fast import kernel_operations
 from sw_codecs.native import CODECS

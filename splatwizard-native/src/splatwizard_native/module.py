@@ -387,7 +387,7 @@ class NativeModule:
         return jobs
 
     def _kept(self, jobs: Sequence[Job], compiler: str) -> list[Path]:
-        """Where objects are kept, by all that they depend on, so that one changed file is compiled alone."""
+        """Places of objects, by all that they depend on, so that one changed file is compiled alone."""
         headers = [path for path in self._files(self._with_cuda()) if path.suffix == ".h"]
         folder, torchs = self.cache_folder / "objects", "" if self.face else importlib.metadata.version("torch")
         places = []

@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from splatwizard_core.base.random_states import seeded
-from sw_codecs import kernel_operations
 from sw_codecs.context.fast import grid_lookup
 from sw_codecs.context.fast.grid_lookup import fits
 from sw_codecs.context.hash_grid import HashGrid

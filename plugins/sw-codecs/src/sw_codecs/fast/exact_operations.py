@@ -217,7 +217,7 @@ def mixture_rows(
 
 
 def _counted(present: Tensor | None, like: Tensor) -> tuple[int, Tensor | None]:
-    """How many numbers are present, and scratch for the starts of rows."""
+    """Count of the present numbers, and scratch for the starts of rows."""
     if present is None:
         return like.numel(), None
     return int(torch.count_nonzero(present)), _scratch(len(like))
