@@ -58,7 +58,7 @@ def _kernels(plugin: str, entries: Iterable[Entry]) -> dict[str, str]:
     targets = [target for each in declared for target in ([each] if isinstance(each, str) else each)]
     ours = [target for target in dict.fromkeys(targets) if target.partition(".")[0] == plugin.partition(".")[0]]
     modules = [pkgutil.resolve_name(target) for target in ours]
-    return {module.name: module.state()["state"] for module in modules}
+    return {module.name: module.state()["state"] for module in modules if module.face}  # others need torch
 
 
 def _print(found: dict[str, Any], *, verbose: bool) -> None:

@@ -32,7 +32,6 @@ class IntegerMlp:
     output_scale    a number or one per output of the last layer: outputs come in units of 1 / output_scale (for
                     HAC: 1 / base step); exact in float64
 
-    `widths` int64 [layers + 1] are those of the inputs and of each layer's outputs.
     Raises ValueError if a weight exceeds 4096 or a sum could reach 2^53.
     """
 
@@ -48,9 +47,8 @@ class IntegerMlp:
         if not self.weights:
             raise ValueError("a network needs at least one layer")
         self._leak = leak
-        integers: list[tuple[np.ndarray, np.ndarray]] = []
+        integers: list[np.ndarray] = []
         width = self.weights[0][0].shape[-1]
-        widths = [width]
         for i, (w, b) in enumerate(self.weights):
             if w.ndim != 2 or b.shape != w.shape[:1] or w.shape[1] != width:
                 raise ValueError(
@@ -65,12 +63,11 @@ class IntegerMlp:
                 raise ValueError(f"layer {i}: a weight is not finite or exceeds {WEIGHT_LIMIT}")
             if (np.abs(wq).sum(1) * ACTIVATION_LIMIT + np.abs(bq)).max(initial=0) >= 2.0**53:
                 raise ValueError(f"layer {i}: sums could reach 2^53 and would not be exact")
-            integers.append((wq, bq))
-            widths.append(width)
-        self._flat = torch.from_numpy(np.concatenate([x.reshape(-1) for layer in integers for x in layer])).to(device)
-        parts = iter(self._flat.split([x.size for layer in integers for x in layer]))
-        self._layers = [(next(parts).view(w.shape), next(parts)) for w, _ in integers]
-        self.widths = torch.tensor(widths)
+            integers += [wq, bq]
+        self._flat = torch.from_numpy(np.concatenate([each.reshape(-1) for each in integers])).to(device)
+        parts = iter(self._flat.split([each.size for each in integers]))
+        self._layers = [(next(parts).view(w.shape), next(parts)) for w, _ in self.weights]
+        self.widths = torch.tensor([self.weights[0][0].shape[1], *(len(b) for _, b in self.weights)])  # and of inputs
 
     @classmethod
     def from_module(cls, module: nn.Module, *, output_scale: float | np.ndarray = 1.0) -> IntegerMlp:
