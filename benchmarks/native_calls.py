@@ -9,6 +9,7 @@ Microseconds are the minimum over all rounds; "x" is the time of the other check
 from __future__ import annotations
 
 import argparse
+import copy
 import json
 import os
 import subprocess
@@ -49,6 +50,42 @@ def training_cases() -> Iterator[tuple[str, Callable[[], object]]]:
             photometric(image, target, 0.2)[0].backward()
 
         yield f"photometric {width} x {height}, forward and backward", loss
+    yield from drawings()
+
+
+def drawings() -> Iterator[tuple[str, Callable[[], object]]]:
+    """Forward and backward passes of rasterizers, and scores."""
+    import torch
+    from scene import make_splats, orbit_cameras
+
+    from splatwizard_core.api import RasterOptions, ScoreSpec
+    from sw_rasterizers.standard import StandardRasterizer
+    from sw_rasterizers.surfel import SurfelRasterizer
+
+    for count, width, height in ((10, 32, 32), (1000, 64, 64), (10_000, 240, 135), (100_000, 480, 270)):
+        g, camera = make_splats(count, requires_grad=True), orbit_cameras(8, width, height)[0]
+        surfels = copy.copy(g)
+        surfels.scales = g.scales.detach()[:, :2].clone().requires_grad_()
+        options = RasterOptions(grad2d=True)
+        scores = RasterOptions(scores=(ScoreSpec("hits", "hits"), ScoreSpec("grad", "grad_sq")))
+
+        def draw(g=g, camera=camera, kind=StandardRasterizer, options=options) -> None:
+            for x in g.tensors().values():
+                x.grad = None
+            kind().render(g, camera, options).image.sum().backward()
+
+        def look(g=g, camera=camera) -> None:
+            with torch.no_grad():
+                StandardRasterizer().render(g, camera, RasterOptions())
+
+        of = f"{count:,} Gaussians, {width} x {height}"
+        yield f"drawing {of}, forward and backward", draw
+        yield f"drawing {of}, forward alone", look
+        yield f"drawing {of}, surfels", lambda draw=draw, surfels=surfels: draw(surfels, kind=SurfelRasterizer)
+        yield (
+            f"drawing {of}, scores",
+            lambda g=g, camera=camera, scores=scores: StandardRasterizer().accumulate(g, [camera], scores),
+        )
 
 
 def exact_cases() -> Iterator[tuple[str, Callable[[], object]]]:

@@ -22,8 +22,9 @@ import numpy as np
 import torch
 
 from splatwizard_core.api import Rasterizer, RasterOptions
-from sw_rasterizers import native, ops
-from sw_rasterizers.ops import BACKWARD_STAGES, FORWARD_STAGES
+from splatwizard_native import operations
+from sw_rasterizers import face, native
+from sw_rasterizers.call import BACKWARD_STAGES, FORWARD_STAGES
 from sw_rasterizers.standard import StandardRasterizer
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -118,7 +119,7 @@ def limits(c: dict[str, int], flops: float, bandwidth: float, *, evaluated: str)
 
 
 def baseline(kind: str, arguments: argparse.Namespace) -> dict[str, float]:
-    """The same measurement with another build, in a process of its own (op names are per process)."""
+    """The same measurement with another build, in a process of its own, which has one build."""
     command = [sys.executable, __file__, "--worker", kind, "--n", str(arguments.n), "--size", arguments.size]
     done = subprocess.run([*command, "--repeats", str(arguments.repeats)], capture_output=True, text=True)
     if done.returncode:
@@ -142,7 +143,7 @@ def main() -> None:
 
     if arguments.worker:
         flags = (*native.MODULE.cflags, *BUILDS[arguments.worker])
-        ops.MODULE = replace(native.MODULE, cflags=flags)
+        face.__getattr__ = operations(replace(native.MODULE, cflags=flags), face.__name__)
         print(json.dumps(measure(StandardRasterizer(), n, width, height, 1, repeats)))
         return
 

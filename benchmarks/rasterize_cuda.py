@@ -28,8 +28,9 @@ from pathlib import Path
 import torch
 
 from splatwizard_core.api import SH, Camera, GaussianInputs, RasterOptions
+from sw_rasterizers.call import BACKWARD_STAGES, FORWARD_STAGES
 from sw_rasterizers.inference import FlashRasterizer, TensorCoreRasterizer
-from sw_rasterizers.ops import BACKWARD_STAGES, FORWARD_STAGES, backward_seconds
+from sw_rasterizers.ops import backward_seconds
 from sw_rasterizers.standard import StandardRasterizer
 
 sys.path.insert(0, str(Path(__file__).parent))

@@ -24,6 +24,8 @@ from sw_reference.testing.rasterizer_checks import checks_for
 
 from splatwizard_core.api import SH, CapabilityError, Feature, RasterOptions, ScoreSpec, ShapeError
 from splatwizard_core.tooling import NegotiatedRasterizer, load_plugins
+from sw_rasterizers import cpu
+from sw_rasterizers.call import Call, Flag, camera_numbers
 from sw_rasterizers.native import MODULE
 from sw_rasterizers.surfel import SurfelRasterizer
 
@@ -282,14 +284,17 @@ def test_a_low_pass_that_surfels_do_not_have_is_told_once(rasterizer, caplog):
 
 def test_the_ops_read_no_further_than_there_is():
     g, cam = draw_scene(replace(MANY, n=20), 1, torch.float32)
-    MODULE.load()
-    pose = [*cam.R.flatten().tolist(), *cam.tau.tolist(), cam.fx, cam.fy, cam.cx, cam.cy, 0.2, 1e10]
-    op = torch.ops.sw_rasterizers.visible_surfel_radii
-    for scales, quats in ((torch.ones(20, 3), g.quats), (g.scales[:19], g.quats), (g.scales, g.quats[:, :3])):
-        with pytest.raises(RuntimeError, match="must be a contiguous tensor of shape"):
-            op(g.means, scales.contiguous(), quats.contiguous(), None, pose, 75, 50)
-    with pytest.raises(RuntimeError, match="malformed camera"):
-        op(g.means, g.scales, g.quats, None, pose[:5], 75, 50)
+    call = Call(camera_numbers(cam), 75, 50, 0, 1.0, 0.0, Flag.SURFELS)
+    for scales, quats, told in (
+        (torch.ones(20, 3), g.quats, r"scales must be \[20, 2\]"),
+        (g.scales[:19], g.quats, "quats must be a contiguous"),
+        (g.scales[:19], g.quats[:19], "19 scales of 20 Gaussians"),
+        (g.scales, g.quats[:, :3].contiguous(), "quats must be a contiguous"),
+    ):
+        with pytest.raises(RuntimeError, match=told):
+            cpu.visible_radii(call, {"means": g.means, "scales": scales, "quats": quats})
+    with pytest.raises(RuntimeError, match="image of 0 x 50"):
+        cpu.visible_radii(replace(call, width=0), {"means": g.means, "scales": g.scales, "quats": g.quats})
     with pytest.raises(ShapeError):
         SurfelRasterizer().visible_filter(replace(g, quats=g.quats[:, :3]), cam)
     with pytest.raises(CapabilityError, match="SURFEL"):

@@ -10,7 +10,7 @@ import torch
 
 from splatwizard_core.api import Camera, CapabilityError, ConfigError, GaussianInputs, RasterizerInfo, RasterOptions
 from sw_rasterizers import plugin
-from sw_rasterizers.ops import Call, Flag
+from sw_rasterizers.call import Call, Flag
 from sw_rasterizers.standard import StandardRasterizer
 
 

@@ -6,17 +6,23 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.api import AccumOutput, CapabilityError, GaussianInputs, RasterOptions, ScoreSpec
-from sw_rasterizers.native import MODULE
-from sw_rasterizers.ops import Call
+from sw_rasterizers import cpu, face
+from sw_rasterizers.call import Call, Flag
+from sw_rasterizers.memory import empty
+from sw_rasterizers.native import cuda_ops
 
 KINDS = (
     "hits", "opacity", "opacity_T", "blend", "blend_max", "gamma", "dist", "blend_sq", "shown", "grad_sq", "removal",
 )  # fmt: skip
 """Score kinds, in the order of `enum ScoreKind` in csrc/scores.h."""
+SENSITIVE = KINDS.index("grad_sq")
+"""The kinds from here on depend on the light behind a splat; `is_sensitive` of csrc/scores.h."""
 MAX_SCORES = 32
 """Largest number of scores per call; `kMaxScores` of csrc/scores.h."""
 FISHER = 21
 """Length of a Fisher block: upper triangle of 6x6, row by row."""
+FISHER_SUMS = 28
+"""Sums of a pair that blocks are made from."""
 
 
 class Totals:
@@ -54,19 +60,60 @@ def add_scores(g: GaussianInputs, call: Call, opt: RasterOptions, totals: Totals
     algorithms; then a Gaussian's sum over the tiles of a view is float32, too. No score is differentiable, and none
     touches a gradient.
     """
-    MODULE.load()
     sh = g.sh
-    tensors = (
-        g.means, g.opacities, g.scales, g.quats, g.cov3d, None if sh is None else sh.dense,
-        None if sh is None else sh.dc, None if sh is None else sh.rest, g.colors,
-    )  # fmt: skip
+    tensors = {
+        "means": g.means, "opacities": g.opacities, "scales": g.scales, "quats": g.quats, "cov3d": g.cov3d,
+        "sh": None if sh is None else sh.dense, "sh_dc": None if sh is None else sh.dc,
+        "sh_rest": None if sh is None else sh.rest, "colors": g.colors,
+    }  # fmt: skip
+    tensors = {name: None if x is None else x.detach().contiguous() for name, x in tensors.items()}
+    if not g.means.is_cuda:
+        _add_on_cpu(tensors, call, opt.scores, totals)
+        return
     weights, rows = _pixel_weights(opt.scores, g.means)
-    torch.ops.sw_rasterizers.accumulate_scores(
-        *(None if x is None else x.detach().contiguous() for x in tensors), call.visible, call.background,
-        *call.settings(),
+    cuda_ops().accumulate_scores(
+        *tensors.values(), call.visible, call.background, *call.settings(),
         [KINDS.index(s.kind) for s in opt.scores], [int(s.rule == "tested") for s in opt.scores],
         [float(s.gamma) for s in opt.scores], rows, weights, totals.scores, totals.fisher,
     )  # fmt: skip
+
+
+def _add_on_cpu(tensors: cpu.Tensors, call: Call, specs: tuple[ScoreSpec, ...], totals: Totals) -> None:
+    flags = call.flags | Flag.SAVE
+    if totals.fisher is None:
+        flags |= Flag.FOR_SCORES
+    picture = cpu.Picture(call, tensors, int(flags))
+    projected = cpu.project(picture, tensors)
+    means, pairs = tensors["means"], projected.found.pairs
+    assert means is not None
+    if pairs == 0:
+        return
+    kinds = [KINDS.index(spec.kind) for spec in specs]
+    sensitive = [i for i, kind in enumerate(kinds) if kind >= SENSITIVE]
+    # What these need of each pixel comes with the picture.
+    image = picture.empty_image(means.dtype) if sensitive or totals.fisher is not None else None
+    _, lists = cpu.make_lists(picture, projected, image)
+    view = {"splats": projected.splats, "lists": lists, "pairs": pairs, **picture.view, **picture.canvas}
+    weights = [given.detach().to(means).contiguous() if (given := _weight(s)) is not None else None for s in specs]
+    for family in ([i for i in range(len(specs)) if i not in sensitive], sensitive):
+        if family:
+            face.add_scores(
+                **view, count=len(means), kinds=[kinds[i] for i in family],
+                tested=[specs[i].rule == "tested" for i in family],
+                gammas=[float(specs[i].gamma) for i in family], weights=[weights[i] for i in family],
+                totals=[totals.scores[i] for i in family], sums=empty((pairs, len(family)), means.dtype),
+            )  # fmt: skip
+    if totals.fisher is not None:
+        face.add_fisher(
+            **view, means=means, scales=tensors["scales"], quats=tensors["quats"], sh_degree=call.sh_degree,
+            scale_modifier=call.scale_modifier, eps2d=call.eps2d, count=len(means), blocks=totals.fisher,
+            sums=empty((pairs, FISHER_SUMS), means.dtype),
+        )  # fmt: skip
+
+
+def _weight(spec: ScoreSpec) -> Tensor | None:
+    """Return the weights [H,W] of pixels, or the residual [3,H,W]."""
+    return spec.pixel_weight if spec.residual is None else spec.residual
 
 
 def _pixel_weights(specs: tuple[ScoreSpec, ...], like: Tensor) -> tuple[Tensor | None, list[int]]:
@@ -74,7 +121,7 @@ def _pixel_weights(specs: tuple[ScoreSpec, ...], like: Tensor) -> tuple[Tensor |
     maps: list[Tensor] = []
     rows = []
     for spec in specs:
-        given = spec.pixel_weight if spec.residual is None else spec.residual
+        given = _weight(spec)
         rows.append(-1 if given is None else len(maps))
         if given is not None:
             maps.extend(given.detach().to(like).reshape(-1, *given.shape[-2:]))

@@ -7,13 +7,16 @@ codebook (csrc/cpu/shared_colors.cpp, csrc/cuda/shared_colors.cu).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from splatwizard_core.api import SH
-from sw_rasterizers.native import MODULE
+from sw_rasterizers import face
+from sw_rasterizers.memory import empty
+from sw_rasterizers.native import cuda_ops
 from sw_rasterizers.segments import Segments
 
 
@@ -26,7 +29,6 @@ def shared_colors(sh: SH, segments: Segments, means: Tensor, center: Tensor, *, 
 
     The gradient of a row is the sum over its users in the order of `segments`, the same in every run on every device.
     """
-    MODULE.load()
     found: Tensor = _SharedColors.apply(sh.codebook, sh.dc, means, segments, center, sh.active_degree, clamp)  # type: ignore[no-untyped-call]
     return found
 
@@ -47,13 +49,40 @@ class _SharedColors(torch.autograd.Function):
         ctx.save_for_backward(*tensors)
         ctx.arguments = segments.indices, center.contiguous(), degree, clamp
         ctx.segments = segments
-        found: Tensor = torch.ops.sw_rasterizers.shared_colors(*tensors, *ctx.arguments)
-        return found
+        if means.is_cuda:
+            found: Tensor = cuda_ops().shared_colors(*tensors, *ctx.arguments)
+            return found
+        colors = empty(tuple(means.shape), means.dtype)
+        face.shade_shared(**_shared(ctx, tensors), colors=colors)
+        return colors
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        codebook, dc, means = torch.ops.sw_rasterizers.shared_colors_backward(
-            *ctx.saved_tensors, *ctx.arguments, ctx.segments.order, ctx.segments.offsets, gradient.contiguous()
-        )
-        return codebook, dc if ctx.saved_tensors[1] is not None else None, means, None, None, None, None
+        tensors, segments, gradient = ctx.saved_tensors, ctx.segments, gradient.contiguous()
+        means, dc, codebook = tensors
+        if means.is_cuda:
+            of_codebook, of_dc, of_means = cuda_ops().shared_colors_backward(
+                *tensors, *ctx.arguments, segments.order, segments.offsets, gradient
+            )
+            return of_codebook, of_dc if dc is not None else None, of_means, None, None, None, None
+        of_means, of_codebook = (empty(tuple(x.shape), x.dtype) for x in (means, codebook))
+        of_dc = None if dc is None else empty(tuple(dc.shape), dc.dtype)
+        face.shade_shared_backward(
+            **_shared(ctx, tensors), order=segments.order, offsets=segments.offsets, by_colors=gradient,
+            passed=empty(tuple(means.shape), means.dtype), of_codebook=of_codebook, of_means=of_means, of_dc=of_dc,
+        )  # fmt: skip
+        return of_codebook, of_dc, of_means, None, None, None, None
+
+
+def _shared(ctx: Any, tensors: Sequence[Tensor | None]) -> dict[str, Any]:
+    (means, dc, codebook), (rows, center, degree, clamp) = tensors, ctx.arguments
+    return {
+        "means": means,
+        "dc": dc,
+        "codebook": codebook,
+        "rows": rows,
+        "center": center,
+        "degree": degree,
+        "clamp": clamp,
+    }

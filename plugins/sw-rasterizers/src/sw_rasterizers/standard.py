@@ -23,7 +23,8 @@ from splatwizard_core.api import (
     ShapeError,
 )
 from sw_rasterizers import plugin
-from sw_rasterizers.ops import Call, Flag, camera_numbers, rasterize, visible_radii
+from sw_rasterizers.call import Call, Flag, camera_numbers
+from sw_rasterizers.ops import rasterize, visible_radii
 from sw_rasterizers.scoring import Totals, add_scores, check_count
 
 CUDA_CHANNELS = 8
@@ -86,8 +87,9 @@ class StandardRasterizer:
             depth["accumulated"] = image[at : at + 1]
             at += 1
         if "expected" in opt.depth:
+            assert alpha is not None
             depth["expected"] = depth["accumulated"] / alpha.clamp(min=1e-10)
-        if "median" in opt.depth:
+        if median is not None and "median" in opt.depth:
             depth["median"] = median
         visible, pairs, evaluated, blended, invalid = call.counts
         return RenderResult(

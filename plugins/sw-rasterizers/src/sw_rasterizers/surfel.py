@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import torch
@@ -19,14 +19,14 @@ from splatwizard_core.api import (
     RasterStats,
     RenderResult,
 )
-from sw_rasterizers import plugin
-from sw_rasterizers.native import MODULE
-from sw_rasterizers.ops import BACKWARD_STAGES, FORWARD_STAGES, Call, Flag, camera_numbers
+from sw_rasterizers import cpu, plugin
+from sw_rasterizers.call import BACKWARD_STAGES, FORWARD_STAGES, Call, Flag, camera_numbers
+from sw_rasterizers.call import INPUTS as INPUTS_OF_ALL
+from sw_rasterizers.native import cuda_ops
 
 INPUTS = ("means", "opacities", "scales", "quats", "sh", "sh_dc", "sh_rest", "colors")
-"""Differentiable inputs in the order in which the ops take them and return their gradients."""
-WITH_MAPS = 1 << 20
-"""Flag besides those of ops.py: also depth, normals and distortion; mirrors `kWithMaps` in csrc/binding_surfel.h."""
+"""Differentiable inputs in the order in which the ops on CUDA take them and return their gradients."""
+OTHERS = {name: None for name in INPUTS_OF_ALL if name not in INPUTS}
 MAPS = {"accumulated": slice(0, 1), "inverse": slice(1, 2), "normals": slice(2, 5), "distortion": slice(5, 6),
         "median": slice(6, 7)}  # fmt: skip
 """Channels of the maps; mirrors `SurfelMap` in csrc/surfel.h."""
@@ -56,11 +56,10 @@ class SurfelRasterizer:
             from sw_reference.surfels import warn_of_low_pass  # here: nearly nobody asks for it
 
             warn_of_low_pass(opt.eps2d)
-        call, flags = self._call(g, cam, opt)
+        call = self._call(g, cam, opt)
         sh = g.sh
         image, radii, alpha, maps = _draw(
             call,
-            flags,
             {
                 "means": g.means,
                 "opacities": g.opacities,
@@ -100,12 +99,13 @@ class SurfelRasterizer:
     def visible_filter(self, g: GaussianInputs, cam: Camera) -> Tensor:
         """Radii [N] int32 from means, scales and quats (opacities and colours are not looked at); 0 = culled."""
         self.info.check_geometry(g)
-        MODULE.load()
         geometry = [None if x is None else x.detach().contiguous() for x in (g.means, g.scales, g.quats)]
-        found: Tensor = torch.ops.sw_rasterizers.visible_surfel_radii(
-            *geometry, _as_bytes(g.visible), camera_numbers(cam), cam.width, cam.height
-        )
-        return found
+        visible, camera = _as_bytes(g.visible), camera_numbers(cam)
+        if g.means.is_cuda:
+            found: Tensor = cuda_ops().visible_surfel_radii(*geometry, visible, camera, cam.width, cam.height)
+            return found
+        call = Call(camera, cam.width, cam.height, 0, 1.0, 0.0, Flag.SURFELS, visible=visible)
+        return cpu.visible_radii(call, dict(zip(("means", "scales", "quats"), geometry, strict=True)))
 
     @torch.no_grad()
     def accumulate(self, g: GaussianInputs, cams: Iterable[Camera], opt: RasterOptions) -> AccumOutput:
@@ -113,7 +113,7 @@ class SurfelRasterizer:
         self.info.check_offered(Feature.asked_by(opt) | Feature.SURFEL)
         return AccumOutput({})
 
-    def _call(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> tuple[Call, int]:
+    def _call(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> Call:
         quirks = opt.profile == "dgr-exact"
         flags = Flag(0)
         for asked, flag in (
@@ -122,12 +122,13 @@ class SurfelRasterizer:
             (quirks or opt.clamp_grad == "pass", Flag.PASS_CLAMP),
             (opt.alpha or "expected" in opt.depth, Flag.ALPHA_MAP),
             (self.count, Flag.COUNT),
+            (bool(opt.depth) or opt.normals or opt.distortion, Flag.WITH_MAPS),
             (torch.are_deterministic_algorithms_enabled(), Flag.ORDERED),
         ):
             if asked:
                 flags |= flag
         background = opt.background_of(3, cam, g.means)
-        call = Call(
+        return Call(
             camera_numbers(cam),
             cam.width,
             cam.height,
@@ -139,7 +140,6 @@ class SurfelRasterizer:
             background=None if background is None else background.detach().contiguous(),
             grad2d=GradBuffer() if torch.is_grad_enabled() and opt.grad2d else None,
         )
-        return call, WITH_MAPS if opt.depth or opt.normals or opt.distortion else 0
 
 
 def _as_bytes(mask: Tensor | None) -> Tensor | None:
@@ -147,21 +147,28 @@ def _as_bytes(mask: Tensor | None) -> Tensor | None:
 
 
 class _DrawSurfels(torch.autograd.Function):
-    """(call, flags, dummy, *INPUTS) -> image [3,H,W], radii [N] int32, alpha [0 or 1,H,W], maps [0 or 7,H,W]."""
+    """(call, dummy, *INPUTS) -> image [3,H,W], radii [N] int32, alpha [1,H,W] or None, maps [7,H,W] or None."""
 
     @staticmethod
-    def forward(ctx: Any, call: Call, flags: int, dummy: Tensor | None, *inputs: Tensor | None) -> tuple[Tensor, ...]:
+    def forward(ctx: Any, call: Call, dummy: Tensor | None, *inputs: Tensor | None) -> tuple[Tensor | None, ...]:
         tensors = [None if x is None else x.detach().contiguous() for x in inputs]
-        image, radii, alpha, maps, saved, call.counts, seconds = torch.ops.sw_rasterizers.render_surfels(
-            *tensors, *_settings(call, flags)
-        )
-        call.seconds.update(zip(FORWARD_STAGES, seconds, strict=False))  # on CUDA only if counting
-        ctx.call, ctx.flags = call, flags
-        ctx.mark_non_differentiable(radii)
+        on_cuda = tensors[0] is not None and tensors[0].is_cuda
+        ctx.call = call
         ctx.set_materialize_grads(False)
+        if on_cuda:
+            image, radii, alpha, maps, saved, call.counts, seconds = cuda_ops().render_surfels(
+                *tensors, *_settings(call)
+            )
+            call.seconds.update(zip(FORWARD_STAGES, seconds, strict=False))  # only if counting
+        else:
+            named = _named(tensors)
+            ctx.picture = cpu.Picture(call, named, int(call.flags | Flag.SURFELS))
+            drawn = cpu.draw(ctx.picture, named)
+            image, radii, alpha, maps = drawn.image, drawn.radii, drawn.alpha, drawn.maps
+            saved, ctx.sizes = drawn.kept[:2], drawn.kept[2:]
+        ctx.mark_non_differentiable(radii)
         # All state goes through save_for_backward, so that it is freed with the graph even if the result lives on.
-        ctx.present = [x is not None for x in tensors]
-        ctx.save_for_backward(*(x for x in tensors if x is not None), *saved)
+        ctx.save_for_backward(*tensors, *saved)
         return image, radii, alpha, maps
 
     @staticmethod
@@ -169,30 +176,39 @@ class _DrawSurfels(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         image, _, alpha, maps = (None if x is None or x.numel() == 0 else x.contiguous() for x in grads)
         call: Call = ctx.call
-        stored = list(ctx.saved_tensors)
-        tensors = [stored.pop(0) if present else None for present in ctx.present]
+        tensors, saved = ctx.saved_tensors[: len(INPUTS)], ctx.saved_tensors[len(INPUTS) :]
         if image is None:
-            means = tensors[0]
-            assert means is not None
-            image = means.new_zeros(3, call.height, call.width)
-        wanted = [*ctx.needs_input_grad[3:], call.grad2d is not None]
-        found, seconds = torch.ops.sw_rasterizers.render_surfels_backward(
-            *tensors, *_settings(call, ctx.flags), stored, image, alpha, maps, wanted
-        )
-        call.seconds.update(zip(BACKWARD_STAGES, seconds, strict=False))
+            image = tensors[0].new_zeros(3, call.height, call.width)
+        asked = ctx.needs_input_grad[2:]
+        if image.is_cuda:
+            wanted = [*asked, call.grad2d is not None]
+            found, seconds = cuda_ops().render_surfels_backward(
+                *tensors, *_settings(call), list(saved), image, alpha, maps, wanted
+            )
+            call.seconds.update(zip(BACKWARD_STAGES, seconds, strict=False))
+            gradients = {name: x for name, x, want in zip((*INPUTS, "grad2d"), found, wanted, strict=True) if want}
+        else:
+            names = {name for name, want in zip(INPUTS, asked, strict=True) if want}
+            gradients = cpu.draw_backward(
+                ctx.picture, _named(tensors), cpu.Kept(*saved, *ctx.sizes),
+                {"image": image, "alpha": alpha, "maps": maps}, names | ({"grad2d"} if call.grad2d else set()),
+            )  # fmt: skip
         if call.grad2d is not None:
-            call.grad2d.set(found[-1])
-        return (None, None, None, *(g if want else None for g, want in zip(found, wanted[:-1], strict=False)))
+            call.grad2d.set(gradients["grad2d"])
+        return None, None, *map(gradients.get, INPUTS)
 
 
-def _settings(call: Call, flags: int) -> tuple[Any, ...]:
+def _named(tensors: Sequence[Tensor | None]) -> cpu.Tensors:
+    return {**OTHERS, **dict(zip(INPUTS, tensors, strict=True))}
+
+
+def _settings(call: Call) -> tuple[Any, ...]:
     return (call.visible, call.background, call.camera, call.width, call.height, call.sh_degree, call.scale_modifier,
-            int(call.flags) | flags)  # fmt: skip
+            int(call.flags))  # fmt: skip
 
 
-def _draw(call: Call, flags: int, tensors: dict[str, Tensor | None]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _draw(call: Call, tensors: dict[str, Tensor | None]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return image, radii, alpha and maps; saves state for backward only if an input needs a gradient."""
-    MODULE.load()
     inputs = [tensors.get(name) for name in INPUTS]
     dummy = None
     if torch.is_grad_enabled():
@@ -200,4 +216,4 @@ def _draw(call: Call, flags: int, tensors: dict[str, Tensor | None]) -> tuple[Te
             dummy = torch.empty(0, requires_grad=True)  # the statistic is wanted even if no input needs a gradient
         if dummy is not None or any(x is not None and x.requires_grad for x in inputs):
             call.flags |= Flag.SAVE
-    return _DrawSurfels.apply(call, flags, dummy, *inputs)  # type: ignore[no-any-return]
+    return _DrawSurfels.apply(call, dummy, *inputs)  # type: ignore[no-any-return]

@@ -6,6 +6,10 @@
 
 #include "common.h"
 
+namespace splatwizard {
+struct Parallel;
+}
+
 namespace sw {
 
 template <class S>
@@ -42,8 +46,8 @@ struct Settings {
   bool detach_features = false;
   bool absgrad = false;    // two more sums a pair: |dL/du|, |dL/dv|
   bool fragments = false;  // with absgrad, those two are the sum of (o dL/do)^2 over the fragments, and their number
-  int threads = 1;
-  int64_t most_pairs = 0;  // (splat, tile) pairs that a call may have; beyond, none are listed
+  const splatwizard::Parallel* parallel = nullptr;  // threads of the CPU; null: the caller's
+  int64_t most_pairs = 0;  // of CUDA: (splat, tile) pairs that a call may have; beyond, none are listed
 };
 
 // Channels of the composited image: colours, then inverse depth, accumulated depth, then features.

@@ -4,6 +4,10 @@
 
 #include <cstdint>
 
+namespace splatwizard {
+struct Parallel;
+}
+
 namespace sw {
 
 template <class S>
@@ -18,7 +22,7 @@ struct SharedColors {
   const S* center;      // [3]
   int degree;
   bool clamp;           // negative colours become 0
-  int threads;          // of the CPU
+  const splatwizard::Parallel* parallel = nullptr;  // threads of the CPU; null: the caller's
 };
 
 }  // namespace sw

@@ -18,11 +18,11 @@ namespace {
 struct RadixSorter {
   static constexpr int kBits = 11, kBuckets = 1 << kBits, kPasses = 3;
   int64_t count;
-  int threads;
+  const splatwizard::Parallel* threads;
   std::unique_ptr<uint32_t[]> keys[2];
   std::unique_ptr<int32_t[]> values;
 
-  RadixSorter(int64_t count, int threads) : count(count), threads(threads) {
+  RadixSorter(int64_t count, const splatwizard::Parallel* threads) : count(count), threads(threads) {
     for (auto& k : keys) k.reset(new uint32_t[count]);
     values.reset(new int32_t[count]);
   }
@@ -39,7 +39,7 @@ struct RadixSorter {
   }
 
   void run_pass(int shift, const uint32_t* keys_in, uint32_t* keys_out, const int32_t* in, int32_t* out) {
-    const int parts = threads;
+    const int parts = count_of(threads);
     std::vector<int64_t> cursor(size_t(parts) * kBuckets, 0);
     parallel_dynamic(threads, parts, [&](int64_t part) {
       int64_t* histogram = cursor.data() + part * kBuckets;
@@ -69,7 +69,8 @@ int64_t chunks_of(int64_t count) { return (count + kChunk - 1) / kChunk; }
 
 // Slots in use, in order; fill_key(i, slot) sees each of them.
 template <class S, class FillKey>
-void list_slots(int64_t count, const Slots<S>& slots, int threads, int32_t* order, const FillKey& fill_key) {
+void list_slots(int64_t count, const Slots<S>& slots, const splatwizard::Parallel* threads, int32_t* order,
+                const FillKey& fill_key) {
   std::vector<int64_t> start(size_t(chunks_of(count)) + 1, 0);
   for (int64_t chunk = 0; chunk < chunks_of(count); ++chunk)
     start[size_t(chunk) + 1] = start[size_t(chunk)] + slots.per_chunk[chunk];
@@ -93,7 +94,8 @@ int64_t count_pairs(int64_t count, const Slots<S>& slots) {
 }
 
 template <>
-void depth_order<float>(int64_t count, int64_t used, const Slots<float>& slots, int threads, int32_t* order) {
+void depth_order<float>(int64_t count, int64_t used, const Slots<float>& slots, const splatwizard::Parallel* threads,
+                        int32_t* order) {
   RadixSorter sorter(used, threads);
   list_slots(count, slots, threads, order, [&](int64_t i, int64_t s) {
     std::memcpy(&sorter.keys[0][i], &slots.records[s * kRecord + kDepth], sizeof(float));
@@ -102,7 +104,8 @@ void depth_order<float>(int64_t count, int64_t used, const Slots<float>& slots, 
 }
 
 template <>
-void depth_order<double>(int64_t count, int64_t used, const Slots<double>& slots, int threads, int32_t* order) {
+void depth_order<double>(int64_t count, int64_t used, const Slots<double>& slots, const splatwizard::Parallel* threads,
+                         int32_t* order) {
   list_slots(count, slots, threads, order, [](int64_t, int64_t) {});
   std::stable_sort(order, order + used, [&](int32_t a, int32_t b) {
     return slots.records[int64_t(a) * kRecord + kDepth] < slots.records[int64_t(b) * kRecord + kDepth];
@@ -113,7 +116,7 @@ template <class S>
 void bin_pairs(const View<S>& view, const Settings& settings, int64_t count, int64_t used, const Slots<S>& slots,
                const int32_t* order, const Pairs<S>& pairs) {
   const int64_t tiles = int64_t(view.tiles_x()) * view.tiles_y();
-  const int parts = settings.threads;
+  const int parts = count_of(settings.parallel);
   constexpr int64_t kAhead = 12;
 
   // Splat-major: the tile of every pair, chunk after chunk. A splat that was dropped leaves its tiles out.
@@ -122,14 +125,14 @@ void bin_pairs(const View<S>& view, const Settings& settings, int64_t count, int
   const auto for_chunk = [&](int64_t chunk, const auto& visit) {
     for (int64_t s = chunk * kChunk, end = s + slots.per_chunk[chunk]; s < end; ++s) visit(slots.run[s]);
   };
-  parallel_dynamic(settings.threads, chunks_of(count), [&](int64_t chunk) {
+  parallel_dynamic(settings.parallel, chunks_of(count), [&](int64_t chunk) {
     for_chunk(chunk, [&](const PairRun& run) { start[size_t(chunk) + 1] += run.count; });
   });
   for (size_t chunk = 1; chunk < start.size(); ++chunk) start[chunk] += start[chunk - 1];
-  parallel_dynamic(settings.threads, chunks_of(count), [&](int64_t chunk) {
+  parallel_dynamic(settings.parallel, chunks_of(count), [&](int64_t chunk) {
     int64_t next = start[size_t(chunk)];
     for_chunk(chunk, [&](PairRun& run) {
-      const int32_t* from = slots.tile_lists[chunk].data() + run.first;
+      const int32_t* from = slots.tiles + slots.tile_at[chunk] + run.first;
       run.first = int32_t(next);
       for (int32_t k = 0; k < run.count; ++k) tile_of[size_t(next++)] = from[k];
     });
@@ -146,7 +149,7 @@ void bin_pairs(const View<S>& view, const Settings& settings, int64_t count, int
       for (int32_t p = run.first; p < run.first + run.count; ++p) visit(order[i], p, tile_of[p]);
     }
   };
-  parallel_dynamic(settings.threads, parts, [&](int64_t part) {
+  parallel_dynamic(settings.parallel, parts, [&](int64_t part) {
     int64_t* histogram = cursor.data() + part * tiles;
     for_range(part, [&](int32_t, int32_t, int32_t tile) { ++histogram[tile]; });
   });
@@ -161,7 +164,7 @@ void bin_pairs(const View<S>& view, const Settings& settings, int64_t count, int
     }
   }
   pairs.tile_start[tiles] = sum;
-  parallel_dynamic(settings.threads, parts, [&](int64_t part) {
+  parallel_dynamic(settings.parallel, parts, [&](int64_t part) {
     int64_t* position = cursor.data() + part * tiles;
     for_range(part, [&](int32_t s, int32_t pair, int32_t tile) {
       const int64_t to = position[tile]++;

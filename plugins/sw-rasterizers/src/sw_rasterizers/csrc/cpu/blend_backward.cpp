@@ -211,7 +211,7 @@ void backward_tiles(const View<Scalar<V>>& view, const Settings& settings, const
   const int64_t tiles = int64_t(view.tiles_x()) * view.tiles_y();
   const std::vector<int32_t> order = tiles_by_work(pairs.tile_start, tiles);
   std::atomic<int64_t> next{0};
-  parallel(settings.threads, [&](int, int) {
+  parallel(settings.parallel, [&] {
     const auto w = std::make_unique<typename Backward::Workspace>();
     w->image_gradient.assign(size_t(canvas.channels) * Backward::kPixels, Scalar<V>(0));
     w->channel_sums.assign(size_t(canvas.channels) * lanes_of<V>, Scalar<V>(0));

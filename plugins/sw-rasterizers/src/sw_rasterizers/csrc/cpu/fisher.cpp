@@ -144,7 +144,7 @@ void sensitivity_tiles(const View<Scalar<V>>& view, const Settings& settings, co
   const int64_t tiles = int64_t(view.tiles_x()) * view.tiles_y();
   const std::vector<int32_t> order = tiles_by_work(pairs.tile_start, tiles);
   std::atomic<int64_t> next{0};
-  parallel(settings.threads, [&](int, int) {
+  parallel(settings.parallel, [&] {
     const auto w = std::make_unique<typename Tiles::Workspace>();
     std::fill_n(&w->weight[0][0][0], sizeof w->weight / sizeof(Scalar<V>), Scalar<V>(0));
     for (int64_t i; (i = next.fetch_add(1, std::memory_order_relaxed)) < tiles;) walk(order[size_t(i)], *w);
@@ -217,7 +217,7 @@ void add_fisher_pack(const View<Scalar<V>>& view, const Gaussians<Scalar<V>>& g,
   template <>                                                                                                     \
   void add_fisher<S>(const View<S>& view, const Gaussians<S>& g, const Settings& settings, const Slots<S>& slots, \
                      const S* sums, double* blocks) {                                                             \
-    parallel_dynamic(settings.threads, (g.count + kChunk - 1) / kChunk, [&](int64_t chunk) {                      \
+    parallel_dynamic(settings.parallel, (g.count + kChunk - 1) / kChunk, [&](int64_t chunk) {                      \
       const int64_t begin = chunk * kChunk, end = begin + slots.per_chunk[chunk];                                 \
       for (int64_t s = begin; s < end; s += lanes_of<V>)                                                          \
         add_fisher_pack<V>(view, g, settings, slots, sums, s, end, blocks);                                       \

@@ -1,4 +1,4 @@
-// The CPU kernels: plain pointers and sizes, no torch. One .cpp a kernel; binding.cpp owns the memory.
+// The CPU kernels: plain pointers and sizes. One .cpp a kernel; the memory is the caller's (face.h).
 //
 //   project            N Gaussians -> records of the drawn ones, in slots (chunk-wise compact, in index order)
 //   bin                slots -> per tile a list of slots, front to back
@@ -10,7 +10,6 @@
 #pragma once
 
 #include <cstdint>
-#include <vector>
 
 #include <splatwizard/dispatch.h>
 
@@ -49,7 +48,9 @@ struct Slots {
   int32_t* index;      // [N] Gaussian of the slot
   int32_t* per_chunk;  // [chunks] slots used
   PairRun* run;        // [N]; `first` counts within the chunk until bin_pairs
-  std::vector<int32_t>* tile_lists;  // [chunks] the tiles of the chunk's pairs; forward pass only
+  int32_t* tiles;      // [room] the tiles of all pairs, chunk by chunk in any order; forward pass only
+  int64_t room;
+  int64_t* tile_at;    // [chunks] where those of the chunk begin
   S* color_slope;      // [N][9] d colour_c / d mean_j, or null
   uint8_t* clamped;    // [N] bit c: colour c was clamped at 0
   S* channels;         // [N][channels], or null if the three colours in the record are all
@@ -97,8 +98,8 @@ inline int pair_columns(bool plain, int channels, bool absgrad, bool median) {
 // The kernels, once per instruction set (splatwizard/dispatch.h).
 //
 // project_gaussians  returns the number of slots in use; counts [3]: Gaussians with a radius, those culled because a
-//                    value is not finite, pairs of all that had tiles. More of these than `most_pairs`: the lists have
-//                    gaps, no other kernel may be called
+//                    value is not finite, pairs of all that had tiles. More of these than there is room for: the lists
+//                    have gaps, no other kernel may be called
 // count_pairs        (splat, tile) pairs in all
 // depth_order        slots in use, nearest first, equal depths in index order; `order` has room for all of them
 // blend_backward     the last `detached` channels do not influence the geometry; sums [P][pair_columns]
@@ -113,7 +114,8 @@ inline int pair_columns(bool plain, int channels, bool absgrad, bool median) {
   template <class S>                                                                                                \
   int64_t count_pairs(int64_t count, const Slots<S>& slots);  \
   template <class S>                                                                                                \
-  void depth_order(int64_t count, int64_t used, const Slots<S>& slots, int threads, int32_t* order);                \
+  void depth_order(int64_t count, int64_t used, const Slots<S>& slots, const splatwizard::Parallel* threads,        \
+                   int32_t* order);                                                                                 \
   template <class S>                                                                                                \
   void bin_pairs(const View<S>& view, const Settings& settings, int64_t count, int64_t used, const Slots<S>& slots, \
                  const int32_t* order, const Pairs<S>& pairs);                                                      \

@@ -63,12 +63,10 @@ struct ChunkProjection : Projector<V, kCov3d> {
   const Slots<S>& slots;
   int32_t* radii;
 
-  // Returns the pairs of the chunk; of them it keeps `room`, that further ones are refused is the caller's business.
-  int64_t operator()(int64_t chunk, int64_t room, int64_t* invalid) const {
+  void operator()(int64_t chunk, TileList& tile_list, int64_t* invalid) const {
     const auto& g = this->g;
     const int64_t begin = chunk * kChunk, end = begin + kChunk < g.count ? begin + kChunk : g.count;
     int64_t slot = begin;
-    TileList tile_list{slots.tile_lists[chunk], room > 0 ? size_t(room) : 0};
     for (int64_t first = begin; first < end; first += L) slot = project_pack(first, end, slot, tile_list, invalid);
     const int64_t used = slot - begin;
     slots.per_chunk[chunk] = int32_t(used);
@@ -77,7 +75,6 @@ struct ChunkProjection : Projector<V, kCov3d> {
     if (slots.channels != nullptr) fill_channels(begin, slot);
     const int total = slots.channels != nullptr ? channels.total() : 0;
     *invalid += shader.drop_broken(begin, slot, total, radii);
-    return tile_list.listed;
   }
 
   int64_t project_pack(int64_t first, int64_t end, int64_t slot, TileList& tile_list, int64_t* invalid) const {
@@ -165,16 +162,21 @@ int64_t project_all(const View<Scalar<V>>& view, const Gaussians<Scalar<V>>& g, 
                     const Channels& channels, const Slots<Scalar<V>>& slots, int32_t* radii, int64_t* counts) {
   const int64_t chunks = (g.count + kChunk - 1) / kChunk;
   const ChunkProjection<V, kCov3d> project_chunk{{view, g, settings}, channels, slots, radii};
-  std::atomic<int64_t> visible{0}, invalid{0}, pairs{0};
-  parallel_dynamic(settings.threads, chunks, [&](int64_t chunk) {
-    int64_t bad = 0;
-    pairs += project_chunk(chunk, settings.most_pairs - pairs, &bad);
-    const int32_t* first = radii + chunk * kChunk;
-    visible += std::count_if(first, first + std::min<int64_t>(kChunk, g.count - chunk * kChunk),
-                             [](int32_t radius) { return radius > 0; });
-    invalid += bad;
+  std::atomic<int64_t> next{0}, visible{0}, invalid{0}, listed{0};
+  parallel(settings.parallel, [&] {
+    TileList tiles;
+    for (int64_t chunk; (chunk = next.fetch_add(1, std::memory_order_relaxed)) < chunks;) {
+      int64_t bad = 0;
+      tiles.start(slots.room - listed);
+      project_chunk(chunk, tiles, &bad);
+      tiles.keep(chunk, listed, slots);
+      const int32_t* first = radii + chunk * kChunk;
+      visible += std::count_if(first, first + std::min<int64_t>(kChunk, g.count - chunk * kChunk),
+                               [](int32_t radius) { return radius > 0; });
+      invalid += bad;
+    }
   });
-  counts[0] = visible, counts[1] = invalid, counts[2] = pairs;
+  counts[0] = visible, counts[1] = invalid, counts[2] = listed;
   int64_t used = 0;
   for (int64_t chunk = 0; chunk < chunks; ++chunk) used += slots.per_chunk[chunk];
   return used;
@@ -187,7 +189,7 @@ void radii_of_all(const View<Scalar<V>>& view, const Gaussians<Scalar<V>>& g, co
   constexpr int L = lanes_of<V>;
   const Projector<V, kCov3d> projector{view, g, settings};
   const int64_t chunks = (g.count + kChunk - 1) / kChunk;
-  parallel_dynamic(settings.threads, chunks, [&](int64_t chunk) {
+  parallel_dynamic(settings.parallel, chunks, [&](int64_t chunk) {
     const int64_t begin = chunk * kChunk, end = begin + kChunk < g.count ? begin + kChunk : g.count;
     for (int64_t first = begin; first < end; first += L) {
       alignas(64) int32_t rows[L];

@@ -148,7 +148,7 @@ struct ChunkBackward {
 
 // Sums of the groups, in their order, to the gradients of the shared shapes.
 template <class S>
-void add_up_groups(int threads, int64_t groups, int64_t shapes, const Gradients<S>& out) {
+void add_up_groups(const splatwizard::Parallel* threads, int64_t groups, int64_t shapes, const Gradients<S>& out) {
   parallel_dynamic(threads, (shapes + kChunk - 1) / kChunk, [&](int64_t chunk) {
     for (int64_t m = chunk * kChunk; m < std::min((chunk + 1) * kChunk, shapes); ++m) {
       S total[kShapeSums] = {};
@@ -169,17 +169,17 @@ void backward_all(const View<Scalar<V>>& view, const Gaussians<Scalar<V>>& g, co
   const ChunkBackward<V, kCov3d> backward_chunk{view, g, settings, channels, slots, sums, columns, out};
   const int64_t chunks = (g.count + kChunk - 1) / kChunk;
   if (out.shape_sums == nullptr) {
-    parallel_dynamic(settings.threads, chunks, [&](int64_t chunk) { backward_chunk(chunk, nullptr); });
+    parallel_dynamic(settings.parallel, chunks, [&](int64_t chunk) { backward_chunk(chunk, nullptr); });
     return;
   }
   const int64_t groups = shape_groups(g.count, g.shapes), floats = g.shapes * kShapeSums;
-  parallel_dynamic(settings.threads, groups, [&](int64_t group) {
+  parallel_dynamic(settings.parallel, groups, [&](int64_t group) {
     Scalar<V>* sums = out.shape_sums + group * floats;
     std::fill_n(sums, floats, Scalar<V>(0));
     for (int64_t chunk = group * chunks / groups; chunk < (group + 1) * chunks / groups; ++chunk)
       backward_chunk(chunk, sums);
   });
-  add_up_groups(settings.threads, groups, g.shapes, out);
+  add_up_groups(settings.parallel, groups, g.shapes, out);
 }
 
 }  // namespace

@@ -158,7 +158,7 @@ void score_tiles(const View<Scalar<V>>& view, const Settings& settings, const Sl
   const int64_t tiles = int64_t(view.tiles_x()) * view.tiles_y();
   const std::vector<int32_t> order = tiles_by_work(pairs.tile_start, tiles);
   std::atomic<int64_t> next{0};
-  parallel(settings.threads, [&](int, int) {
+  parallel(settings.parallel, [&] {
     const auto w = std::make_unique<typename TileScorer<V>::Workspace>();
     for (int64_t i; (i = next.fetch_add(1, std::memory_order_relaxed)) < tiles;) scorer(order[size_t(i)], *w);
   });
@@ -169,7 +169,7 @@ void score_tiles(const View<Scalar<V>>& view, const Settings& settings, const Sl
 template <class S>
 void add_scores(int64_t count, const Settings& settings, const Slots<S>& slots, const Scores<S>& scores, const S* sums,
                 double* const* totals) {
-  parallel_dynamic(settings.threads, (count + kChunk - 1) / kChunk, [&](int64_t chunk) {
+  parallel_dynamic(settings.parallel, (count + kChunk - 1) / kChunk, [&](int64_t chunk) {
     for (int64_t slot = chunk * kChunk, end = slot + slots.per_chunk[chunk]; slot < end; ++slot) {
       const PairRun run = slots.run[slot];
       const S* rows = sums + int64_t(run.first) * scores.count;

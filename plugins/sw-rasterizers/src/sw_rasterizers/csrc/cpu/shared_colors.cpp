@@ -151,7 +151,7 @@ struct SharedShader {
 
 template <class V, class Body>
 void for_packs(const SharedColors<Scalar<V>>& in, const Body& body) {
-  parallel_dynamic(in.threads, (in.count + kGaussians - 1) / kGaussians, [&](int64_t chunk) {
+  parallel_dynamic(in.parallel, (in.count + kGaussians - 1) / kGaussians, [&](int64_t chunk) {
     const int64_t end = std::min((chunk + 1) * kGaussians, in.count);
     for (int64_t first = chunk * kGaussians; first < end; first += lanes_of<V>) body(first, end);
   });
@@ -161,7 +161,7 @@ template <class V>
 void codebook_of(const SharedColors<Scalar<V>>& in, const int64_t* order, const int64_t* offsets,
                  const Scalar<V>* passed, Scalar<V>* codebook) {
   const SharedShader<V> shader{in};
-  parallel_dynamic(in.threads, (in.entries + kEntries - 1) / kEntries, [&](int64_t chunk) {
+  parallel_dynamic(in.parallel, (in.entries + kEntries - 1) / kEntries, [&](int64_t chunk) {
     const int64_t end = std::min((chunk + 1) * kEntries, in.entries);
     for (int64_t m = chunk * kEntries; m < end; ++m)
       shader.entry(order + offsets[m], order + offsets[m + 1], passed, codebook + m * in.stride);

@@ -216,7 +216,7 @@ void blend_tiles(const View<Scalar<V>>& view, const Settings& settings, const Sl
   const int64_t tiles = int64_t(view.tiles_x()) * view.tiles_y();
   const std::vector<int32_t> order = tiles_by_work(pairs.tile_start, tiles);
   std::atomic<int64_t> next{0}, evaluated{0}, blended{0};
-  parallel(settings.threads, [&](int, int) {
+  parallel(settings.parallel, [&] {
     const auto w = std::make_unique<typename Blender::Workspace>();
     for (int64_t i; (i = next.fetch_add(1, std::memory_order_relaxed)) < tiles;) blender(order[size_t(i)], *w);
     evaluated += w->evaluated;

@@ -72,18 +72,15 @@ struct ChunkProjection : SurfelProjector<V> {
   S* planes;
   int32_t* radii_of_all;
 
-  // Returns the pairs of the chunk; keeps `room` of them.
-  int64_t operator()(int64_t chunk, int64_t room, int64_t* invalid) const {
+  void operator()(int64_t chunk, TileList& tile_list, int64_t* invalid) const {
     const auto& g = this->g;
     const int64_t begin = chunk * kChunk, end = std::min(begin + kChunk, g.count);
     int64_t slot = begin;
-    TileList tile_list{slots.tile_lists[chunk], room > 0 ? size_t(room) : 0};
     for (int64_t first = begin; first < end; first += L) slot = project_pack(first, end, slot, tile_list, invalid);
     slots.per_chunk[chunk] = int32_t(slot - begin);
     const Shader<V> shader{this->view, g, this->settings, slots};
     shader.color(begin, slot);
     *invalid += shader.drop_broken(begin, slot, 0, radii_of_all);
-    return tile_list.listed;
   }
 
   int64_t project_pack(int64_t first, int64_t end, int64_t slot, TileList& tile_list, int64_t* invalid) const {
@@ -166,16 +163,21 @@ int64_t project_all(const View<Scalar<V>>& view, const Gaussians<Scalar<V>>& g, 
                     const Slots<Scalar<V>>& slots, Scalar<V>* planes, int32_t* radii, int64_t* counts) {
   const int64_t chunks = (g.count + kChunk - 1) / kChunk;
   const ChunkProjection<V> project_chunk{{view, g, settings}, slots, planes, radii};
-  std::atomic<int64_t> visible{0}, invalid{0}, pairs{0};
-  parallel_dynamic(settings.threads, chunks, [&](int64_t chunk) {
-    int64_t bad = 0;
-    pairs += project_chunk(chunk, settings.most_pairs - pairs, &bad);
-    const int32_t* first = radii + chunk * kChunk;
-    visible += std::count_if(first, first + std::min<int64_t>(kChunk, g.count - chunk * kChunk),
-                             [](int32_t radius) { return radius > 0; });
-    invalid += bad;
+  std::atomic<int64_t> next{0}, visible{0}, invalid{0}, listed{0};
+  parallel(settings.parallel, [&] {
+    TileList tiles;
+    for (int64_t chunk; (chunk = next.fetch_add(1, std::memory_order_relaxed)) < chunks;) {
+      int64_t bad = 0;
+      tiles.start(slots.room - listed);
+      project_chunk(chunk, tiles, &bad);
+      tiles.keep(chunk, listed, slots);
+      const int32_t* first = radii + chunk * kChunk;
+      visible += std::count_if(first, first + std::min<int64_t>(kChunk, g.count - chunk * kChunk),
+                               [](int32_t radius) { return radius > 0; });
+      invalid += bad;
+    }
   });
-  counts[0] = visible, counts[1] = invalid, counts[2] = pairs;
+  counts[0] = visible, counts[1] = invalid, counts[2] = listed;
   int64_t used = 0;
   for (int64_t chunk = 0; chunk < chunks; ++chunk) used += slots.per_chunk[chunk];
   return used;
@@ -185,7 +187,7 @@ template <class V>
 void radii_of(const View<Scalar<V>>& view, const Gaussians<Scalar<V>>& g, const Settings& settings, int32_t* radii) {
   constexpr int L = lanes_of<V>;
   const SurfelProjector<V> projector{view, g, settings};
-  parallel_dynamic(settings.threads, (g.count + kChunk - 1) / kChunk, [&](int64_t chunk) {
+  parallel_dynamic(settings.parallel, (g.count + kChunk - 1) / kChunk, [&](int64_t chunk) {
     const int64_t begin = chunk * kChunk, end = std::min(begin + kChunk, g.count);
     for (int64_t first = begin; first < end; first += L) {
       alignas(64) int32_t rows[L];

@@ -84,7 +84,7 @@ struct ChunkBackward {
   void project_surfels_backward<S>(const View<S>& view, const Gaussians<S>& g, const Settings& settings,          \
                                    const Slots<S>& slots, const S* sums, bool maps, const Gradients<S>& out) {    \
     const ChunkBackward<V> backward_chunk{view, g, settings, slots, sums, maps, out};                             \
-    parallel_dynamic(settings.threads, (g.count + kChunk - 1) / kChunk, backward_chunk);                          \
+    parallel_dynamic(settings.parallel, (g.count + kChunk - 1) / kChunk, backward_chunk);                          \
   }
 SW_INSTANTIATE(float, Lanes)
 SW_INSTANTIATE(double, double)

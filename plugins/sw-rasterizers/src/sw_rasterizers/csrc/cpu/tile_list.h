@@ -1,6 +1,8 @@
-// The tiles that one splat is tried in, appended to the list of its chunk.
+// The tiles that one splat is tried in, appended to the list of its chunk, and those of a chunk to those of all.
 #pragma once
 
+#include <algorithm>
+#include <atomic>
 #include <vector>
 
 #include "../tiles.h"
@@ -10,12 +12,24 @@ namespace SW_ARCH {
 using namespace sw;
 
 struct TileList {
-  std::vector<int32_t>& tiles;
-  size_t room;         // further ones are counted, not kept
+  std::vector<int32_t> tiles;
+  size_t room = 0;     // further ones are counted, not kept
   int64_t listed = 0;  // with those
   size_t size() const { return tiles.size(); }
   void put(int tile) {
     if (tiles.size() < room) tiles.push_back(tile);
+  }
+
+  void start(int64_t room_left) {
+    tiles.clear();
+    room = room_left > 0 ? size_t(room_left) : 0, listed = 0;
+  }
+  // Moves what was listed of a chunk to that of all, whose number is `total`, if it still fits.
+  template <class S>
+  void keep(int64_t chunk, std::atomic<int64_t>& total, const Slots<S>& slots) const {
+    const int64_t at = total.fetch_add(listed);
+    slots.tile_at[chunk] = at;
+    if (at + listed <= slots.room) std::copy(tiles.begin(), tiles.end(), slots.tiles + at);
   }
 };
 

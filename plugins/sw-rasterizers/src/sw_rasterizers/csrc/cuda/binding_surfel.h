@@ -1,4 +1,4 @@
-// What the CPU and the CUDA binding of surfels share: the arguments of the ops, checked.
+// The arguments of the CUDA ops of surfels, checked.
 #pragma once
 
 #include <array>
@@ -15,7 +15,6 @@ enum WantedSurfel {  // order of the gradients asked for and returned
 };
 // clang-format on
 
-constexpr int64_t kWithMaps = 1 << 20;  // beside the flags of binding.h; mirrored in surfel.py
 inline const OptionalTensor kNone;
 
 struct SurfelInputs : Inputs {

@@ -1,7 +1,6 @@
-// What the CPU and the CUDA binding share: the arguments of the ops, checked, as the kernels take them.
+// What the CUDA bindings share: the arguments of the ops, checked, as the kernels take them.
 #pragma once
 
-#include <ATen/Parallel.h>
 #include <ATen/core/Tensor.h>
 
 #include <algorithm>
@@ -11,34 +10,13 @@
 #include <limits>
 #include <optional>
 
-#include "call.h"
+#include "../call.h"
+#include "../flags.h"
 
 namespace sw {
 
 using at::Tensor;
 using OptionalTensor = std::optional<Tensor>;
-
-enum Flag : int64_t {  // mirrored in ops.py
-  kAntialias = 1,
-  kClampColor = 2,
-  kTight = 4,
-  kPassClamp = 8,
-  kInverseDepth = 16,
-  kAccumulatedDepth = 32,
-  kMedianDepth = 64,
-  kDetachFeatures = 128,
-  kAbsgrad = 256,
-  kAlphaMap = 512,
-  kSave = 1024,
-  kCount = 2048,
-  kOriginalJacobian = 4096,
-  kFlash = 8192,  // CUDA only
-  kTensorCores = 16384,
-  kBytes = 32768,
-  kForScores = 65536,  // between the ops on CUDA: with kSave, nothing that only the backward pass needs
-  kOrdered = 131072,   // CUDA: sums of the backward pass in one order; on the CPU they always are
-  kFragments = 262144,
-};
 
 template <class S>
 S* data(const Tensor& t) {
@@ -61,9 +39,6 @@ inline int64_t most_pairs() {
 inline void check_pairs(int64_t count, int64_t most, const char* memory) {
   TORCH_CHECK(count <= most, "sw_rasterizers: ", count, " splat-tile pairs are more than ", most,
               ": draw fewer Gaussians or a smaller image, or set SPLATWIZARD_MAX_TILE_PAIRS (", memory, ")");
-}
-inline void check_pairs_on_cpu(int64_t count, const sw::Settings& settings) {
-  check_pairs(count, settings.most_pairs, "12 bytes each, 70 in training, which takes half as many");
 }
 
 struct Inputs {
@@ -170,8 +145,7 @@ struct Inputs {
     s.accumulated_depth = flags & kAccumulatedDepth, s.median_depth = flags & kMedianDepth;
     s.detach_features = flags & kDetachFeatures, s.absgrad = flags & kAbsgrad;
     s.fragments = flags & kFragments;
-    s.threads = at::get_num_threads();
-    s.most_pairs = most_pairs() / (means.is_cpu() && (flags & kSave) ? 2 : 1);
+    s.most_pairs = most_pairs();
     return s;
   }
 

@@ -15,7 +15,7 @@
 #include "binding_cuda.h"
 #include "binding_scores.h"
 #include "binding_state.h"
-#include "cuda/score_kernels.h"
+#include "score_kernels.h"
 
 namespace {
 
@@ -83,6 +83,16 @@ void accumulate_scores(const Tensor& means, const Tensor& opacities, const Optio
 }
 
 }  // namespace
+
+TORCH_LIBRARY_FRAGMENT(sw_rasterizers, m) {
+  // kinds: enum ScoreKind; rules: 1 tested, 0 blended; weight_rows: which of `weights` [M,H,W], of a
+  // removal the first of its residual's three, or -1. Adds to `totals` [scores, N] and `blocks` [N, 21], both float64, and so may be called for one view after another.
+  m.def(
+      "accumulate_scores(Tensor means, Tensor opacities, Tensor? scales, Tensor? quats, Tensor? cov3d, Tensor? sh, "
+      "Tensor? sh_dc, Tensor? sh_rest, Tensor? colors, Tensor? visible, Tensor? background, float[] camera, int width, "
+      "int height, int sh_degree, float scale_modifier, float eps2d, int flags, int[] kinds, int[] rules, "
+      "float[] gammas, int[] weight_rows, Tensor? weights, Tensor(a!) totals, Tensor(b!)? blocks) -> ()");
+}
 
 TORCH_LIBRARY_IMPL(sw_rasterizers, CUDA, m) { m.impl("accumulate_scores", accumulate_scores); }
 

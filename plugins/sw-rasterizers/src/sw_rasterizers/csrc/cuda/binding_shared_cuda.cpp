@@ -12,7 +12,7 @@
 #include <tuple>
 
 #include "binding_shared.h"
-#include "cuda/shared_colors.h"
+#include "shared_colors.h"
 
 namespace {
 
@@ -58,6 +58,16 @@ std::tuple<Tensor, Tensor, Tensor> shared_colors_backward(const Tensor& means, c
 }
 
 }  // namespace
+
+TORCH_LIBRARY_FRAGMENT(sw_rasterizers, m) {
+  // rows [N] int64 below M, which the caller has checked; order [N] and offsets [M+1]: the users of each entry.
+  m.def(
+      "shared_colors(Tensor means, Tensor? dc, Tensor codebook, Tensor rows, Tensor center, int degree, bool clamp) "
+      "-> Tensor");
+  m.def(
+      "shared_colors_backward(Tensor means, Tensor? dc, Tensor codebook, Tensor rows, Tensor center, int degree, "
+      "bool clamp, Tensor order, Tensor offsets, Tensor gradient) -> (Tensor codebook, Tensor dc, Tensor means)");
+}
 
 TORCH_LIBRARY_IMPL(sw_rasterizers, CUDA, m) {
   m.impl("shared_colors", shared_colors);

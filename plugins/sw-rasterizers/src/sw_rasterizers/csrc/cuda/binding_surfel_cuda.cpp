@@ -11,7 +11,7 @@
 
 #include "binding_cuda.h"
 #include "binding_surfel.h"
-#include "cuda/surfel_kernels.h"
+#include "surfel_kernels.h"
 
 namespace {
 
@@ -175,6 +175,22 @@ Tensor surfel_radii(const Tensor& means, const OptionalTensor& scales, const Opt
 }
 
 }  // namespace
+
+TORCH_LIBRARY_FRAGMENT(sw_rasterizers, m) {
+  m.def(
+      "render_surfels(Tensor means, Tensor opacities, Tensor? scales, Tensor? quats, Tensor? sh, Tensor? sh_dc, "
+      "Tensor? sh_rest, Tensor? colors, Tensor? visible, Tensor? background, float[] camera, int width, int height, "
+      "int sh_degree, float scale_modifier, int flags) "
+      "-> (Tensor image, Tensor radii, Tensor alpha, Tensor maps, Tensor[] saved, int[] counts, float[] seconds)");
+  m.def(
+      "render_surfels_backward(Tensor means, Tensor opacities, Tensor? scales, Tensor? quats, Tensor? sh, "
+      "Tensor? sh_dc, Tensor? sh_rest, Tensor? colors, Tensor? visible, Tensor? background, float[] camera, "
+      "int width, int height, int sh_degree, float scale_modifier, int flags, Tensor[] saved, Tensor image_gradient, "
+      "Tensor? alpha_gradient, Tensor? maps_gradient, bool[9] wanted) -> (Tensor[] gradients, float[] seconds)");
+  m.def(
+      "visible_surfel_radii(Tensor means, Tensor? scales, Tensor? quats, Tensor? visible, float[] camera, int width, "
+      "int height) -> Tensor");
+}
 
 TORCH_LIBRARY_IMPL(sw_rasterizers, CUDA, m) {
   m.impl("render_surfels", render);

@@ -1,13 +1,12 @@
-// What the CPU and the CUDA binding of shared colours have in common: the arguments of the ops, checked.
+// The arguments of the CUDA ops of shared colours, checked.
 #pragma once
 
-#include <ATen/Parallel.h>
 #include <ATen/core/Tensor.h>
 
 #include <limits>
 
 #include "binding.h"
-#include "shared_colors.h"
+#include "../shared_colors.h"
 
 namespace sw {
 
@@ -26,8 +25,7 @@ struct SharedInputs {
 
   void check_all() const {
     const auto type = means.scalar_type();
-    TORCH_CHECK(type == at::kFloat || (type == at::kDouble && means.is_cpu()),
-                "sw_rasterizers: means must be float32, on the CPU also float64, got ", type);
+    TORCH_CHECK(type == at::kFloat, "sw_rasterizers: on CUDA means must be float32, got ", type);
     TORCH_CHECK(means.dim() == 2 && codebook.dim() == 3, "sw_rasterizers: means must be [N,3], codebook [M,K,3]");
     const int64_t n = means.size(0), basis = (degree + 1) * (degree + 1);
     check("means", means, {n, 3}, type);
@@ -52,7 +50,7 @@ struct SharedInputs {
   SharedColors<S> of() const {
     return {means.size(0),     codebook.size(0),     data<S>(means),        data<S>(dc),     data<S>(codebook),
             3 * codebook.size(1), int(dc.has_value()), data<int64_t>(rows), data<S>(center), int(degree),
-            clamp,             at::get_num_threads()};
+            clamp};
   }
 };
 

@@ -1,8 +1,8 @@
-// What the CPU and the CUDA binding of the scores share: the op's arguments, checked.
+// The arguments of the CUDA op of the scores, checked.
 #pragma once
 
 #include "binding.h"
-#include "scores.h"
+#include "../scores.h"
 
 namespace sw {
 

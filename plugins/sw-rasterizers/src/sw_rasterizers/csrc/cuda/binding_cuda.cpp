@@ -309,6 +309,18 @@ Tensor visible_radii_on_cuda(const Tensor& means, const OptionalTensor& scales, 
 
 }  // namespace
 
+TORCH_LIBRARY(sw_rasterizers, m) {
+  m.def(
+      "render(Tensor means, Tensor opacities, Tensor? scales, Tensor? quats, Tensor? cov3d, Tensor? sh, "
+      "Tensor? sh_dc, Tensor? sh_rest, Tensor? colors, Tensor? features, Tensor? scale_factors, Tensor? geom_indices, "
+      "Tensor? visible, Tensor? background, "
+      "float[] camera, int width, int height, int sh_degree, float scale_modifier, float eps2d, int flags) "
+      "-> (Tensor image, Tensor radii, Tensor alpha, Tensor median, Tensor[] saved, int[] counts, float[] seconds)");
+  m.def(
+      "visible_radii(Tensor means, Tensor? scales, Tensor? quats, Tensor? cov3d, Tensor? scale_factors, Tensor? geom_indices, "
+      "Tensor? visible, float[] camera, int width, int height, float scale_modifier, float eps2d) -> Tensor");
+}
+
 TORCH_LIBRARY_IMPL(sw_rasterizers, CUDA, m) {
   m.impl("render", render);
   m.impl("visible_radii", visible_radii_on_cuda);

@@ -17,7 +17,7 @@
 #include <vector>
 
 #include "binding.h"
-#include "cuda/kernels.h"
+#include "kernels.h"
 
 namespace sw::cuda {
 

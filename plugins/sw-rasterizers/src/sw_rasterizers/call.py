@@ -1,0 +1,81 @@
+"""What one drawing is about, besides its tensors to differentiate by."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass, field
+from typing import Any
+
+from torch import Tensor
+
+from splatwizard_core.api import Camera, GradBuffer
+
+INPUTS = (
+    "means", "opacities", "scales", "quats", "cov3d", "sh", "sh_dc", "sh_rest", "colors", "features", "scale_factors",
+)  # fmt: skip
+"""Differentiable inputs in the order in which the ops on CUDA take them."""
+
+FORWARD_STAGES = ("project", "sort", "bin", "blend")
+BACKWARD_STAGES = ("blend_backward", "project_backward")
+
+
+class Flag(enum.IntFlag):
+    """Flags of one call, as in csrc/flags.h."""
+
+    ANTIALIAS = 1
+    CLAMP_COLOR = 2
+    TIGHT = 4
+    PASS_CLAMP = 8
+    INVERSE_DEPTH = 16
+    ACCUMULATED_DEPTH = 32
+    MEDIAN_DEPTH = 64
+    DETACH_FEATURES = 128
+    ABSGRAD = 256
+    ALPHA_MAP = 512
+    SAVE = 1024
+    COUNT = 2048
+    ORIGINAL_JACOBIAN = 4096
+    FLASH = 8192  # CUDA only
+    TENSOR_CORES = 16384
+    BYTES = 32768
+    FOR_SCORES = 65536  # with SAVE: nothing that only the backward pass needs
+    ORDERED = 131072
+    FRAGMENTS = 262144  # with ABSGRAD: other sums in its two columns
+    SURFELS = 1 << 19  # on the CPU
+    WITH_MAPS = 1 << 20  # of surfels: depth, normals and distortion
+
+
+@dataclass
+class Call:
+    """Non-differentiable arguments of one call, and buffers for its by-products.
+
+    camera          18 numbers: R, tau, fx, fy, cx, cy, near, far
+    geom_indices    [N] int64, rows of scales and quats, none outside: the kernels do not look
+    seconds         stage -> seconds, filled by the forward pass, on the CPU also by the backward pass
+    counts          visible Gaussians, (splat, tile) pairs, evaluated and blended pixel-splat pairs (-1 unless counted),
+                    inputs that are not finite
+    """
+
+    camera: list[float]
+    width: int
+    height: int
+    sh_degree: int
+    scale_modifier: float
+    eps2d: float
+    flags: Flag
+    geom_indices: Tensor | None = None
+    visible: Tensor | None = None
+    background: Tensor | None = None
+    grad2d: GradBuffer | None = None
+    absgrad2d: GradBuffer | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
+    counts: list[int] = field(default_factory=list)
+
+    def settings(self) -> tuple[Any, ...]:
+        """Return the arguments of the ops on CUDA."""
+        return self.camera, self.width, self.height, self.sh_degree, self.scale_modifier, self.eps2d, int(self.flags)
+
+
+def camera_numbers(cam: Camera) -> list[float]:
+    """Return the camera as [18] numbers: R row by row, tau, fx, fy, cx, cy, near, far."""
+    return [*cam.pose, cam.fx, cam.fy, cam.cx, cam.cy, cam.near, cam.far]
