@@ -23,6 +23,7 @@ HERE = Path(__file__).resolve().parents[1]
 def cases() -> Iterator[tuple[str, Callable[[], object]]]:
     """Name and call of each case; what checkouts share is used alone."""
     import torch
+    from sw_gaussians.sparse_adam import sparse_adam_steps
 
     from splatwizard_native import AdamUpdate, adam_steps, photometric
 
@@ -35,6 +36,9 @@ def cases() -> Iterator[tuple[str, Callable[[], object]]]:
         shapes = [(count, columns) for columns in (3, 3, 45, 1, 3, 4)]
         updates = [AdamUpdate(*(rand(*s) for _ in range(4)), 1e-3, 0.9, 0.999, 1e-15, 10) for s in shapes]
         yield f"adam of {count:,} Gaussians", lambda updates=updates: adam_steps(updates)
+        rows = rand(count) < 0.4
+        yield (f"sparse adam of {count:,} Gaussians",
+               lambda updates=updates, rows=rows: sparse_adam_steps(updates, rows))  # fmt: skip
     for height, width in ((16, 16), (135, 240), (540, 960)):
         image, target = rand(3, height, width).requires_grad_(), rand(3, height, width)
 
