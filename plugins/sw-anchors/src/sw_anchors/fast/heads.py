@@ -55,7 +55,7 @@ class _Heads(torch.autograd.Function):
         *parameters: Tensor,
     ) -> tuple[Tensor, ...]:
         # Features, offsets and scales may be columns of a matrix: of these a row must be without gaps.
-        inputs = without_gaps(
+        inputs: Any = without_gaps(
             (center, positions, features, offsets, scales, masks), (None, None, (1,), (3, 1), (1,), None)
         )
         center, positions, features, offsets, scales, masks = inputs

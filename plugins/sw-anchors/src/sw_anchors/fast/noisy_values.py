@@ -44,13 +44,12 @@ class _Values(torch.autograd.Function):
         ctx.threshold = threshold
         steps, mask_weights = (t if t is None else t.contiguous() for t in (steps, mask_weights))
         tables = tuple(t.contiguous() for t in tables)
-        kept = (rows, mask_weights, steps, uniform, drawn, *tables)
-        ctx.save_for_backward(*kept)
+        ctx.save_for_backward(rows, mask_weights, steps, uniform, drawn, *tables)
         found = [table.new_empty(len(rows), *table.shape[1:]) for table in tables]
         found.append(found[0].new_empty(len(drawn), tables[0].shape[1] + 6 + 3 * tables[3].shape[1]))
         features, scales, offsets, masks, sample = found
         face.noisy_values(
-            **_named(*kept, threshold=threshold),
+            **_named(rows, mask_weights, steps, uniform, drawn, *tables, threshold=threshold),
             to_features=features, to_scales=scales, to_offsets=offsets, to_masks=masks, to_sample=sample,
         )  # fmt: skip
         return tuple(found)

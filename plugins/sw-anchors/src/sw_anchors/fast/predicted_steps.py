@@ -95,6 +95,16 @@ class _ByKernel(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, by_steps: Tensor, by_hidden: Tensor) -> tuple[Tensor | None, ...]:
         base, features, *parameters, hidden, tangents = ctx.saved_tensors
-        slopes = by_steps.contiguous(), by_hidden.contiguous()
-        found = slopes_by_kernel(features, parameters, base, *ctx.bounds, hidden, tangents, *slopes)
+        offset, smallest = ctx.bounds
+        found = slopes_by_kernel(
+            features,
+            parameters,
+            base,
+            offset,
+            smallest,
+            hidden,
+            tangents,
+            by_steps.contiguous(),
+            by_hidden.contiguous(),
+        )
         return None, None, None, *found

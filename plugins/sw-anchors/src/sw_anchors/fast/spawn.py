@@ -83,7 +83,7 @@ class _Gaussians(torch.autograd.Function):
             )
         else:
             learning = [*given[:3], given[3] if positions_learn else None, *given[4:]]
-            zeros = [None if t is None else t.new_zeros(t.shape) for t in learning]
+            zeros: list[Any] = [None if t is None else t.new_zeros(t.shape) for t in learning]
             to_alpha, to_geometry, to_color, to_positions, to_offsets, to_scales, to_masks = zeros
             means, opacities, sizes, quats, colors = contiguous
             face.spawn_backward(
