@@ -216,8 +216,7 @@ def test_no_modules_name_each_other_outside_a_room_of_the_core():
 @pytest.mark.parametrize("package", [CORE, *PACKAGES, *STRANGERS], ids=lambda p: p.name)
 def test_the_base_is_imported_by_its_public_names_where_it_is_declared(package):
     used = {m for p in files_of(package) for m in imported(p) if m.startswith("splatwizard_native")}
-    public = {*splatwizard_native.__all__, "operations.operations"}  # a module's name cannot be a function's too
-    assert used <= {f"splatwizard_native.{name}" for name in public}
+    assert used <= {f"splatwizard_native.{name}" for name in splatwizard_native.__all__}
     assert ("splatwizard-native" in declared_dependencies(package)) == bool(used)
 
 

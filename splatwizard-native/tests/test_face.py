@@ -8,7 +8,7 @@ import torch
 from native_package import digest_of, needs_compiler
 
 from splatwizard_native.face import Field, read_structs
-from splatwizard_native.operations import operations
+from splatwizard_native.face_operations import operations
 
 HEADER = """
 #include <splatwizard/c_face.h>

@@ -8,7 +8,7 @@ import pytest
 import torch
 from native_package import needs_compiler
 
-from splatwizard_native.operations import POOL, pool_runner
+from splatwizard_native.face_operations import POOL, pool_runner
 
 pytestmark = needs_compiler
 

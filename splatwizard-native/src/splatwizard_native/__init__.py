@@ -15,6 +15,7 @@ MODULES = {
         "FULL CompilerMissingError DeviceMemoryError DiskFullError ForeseenError NativeBuildError out_of_memory "
         "shortened"
     ),
+    "face_operations": "operations",
     "files": (
         "TEMPORARY bytes_with_named file_sha256 naming_full_disk new_folder remove_folder replacing scratch_folder "
         "sweep write_atomic write_json"
@@ -27,7 +28,6 @@ MODULES = {
     "lock": "HeldError file_lock read_holder",
     "memory": "MemoryMeter peak_rss_bytes reset_peak_rss rss_bytes synchronize",
     "module": "NativeModule",
-    "operations": "operations",
     "progress": "Bar duration track",
     "settings": "cache_root fast_enabled",
     "strict_json": "dump_strict json_reason load_strict",

@@ -11,6 +11,7 @@ from splatwizard_native.errors import ForeseenError as ForeseenError
 from splatwizard_native.errors import NativeBuildError as NativeBuildError
 from splatwizard_native.errors import out_of_memory as out_of_memory
 from splatwizard_native.errors import shortened as shortened
+from splatwizard_native.face_operations import operations as operations
 from splatwizard_native.files import TEMPORARY as TEMPORARY
 from splatwizard_native.files import bytes_with_named as bytes_with_named
 from splatwizard_native.files import file_sha256 as file_sha256
@@ -40,7 +41,6 @@ from splatwizard_native.memory import reset_peak_rss as reset_peak_rss
 from splatwizard_native.memory import rss_bytes as rss_bytes
 from splatwizard_native.memory import synchronize as synchronize
 from splatwizard_native.module import NativeModule as NativeModule
-from splatwizard_native.operations import operations as operations
 from splatwizard_native.progress import Bar as Bar
 from splatwizard_native.progress import duration as duration
 from splatwizard_native.progress import track as track

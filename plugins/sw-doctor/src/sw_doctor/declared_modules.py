@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from splatwizard_core.tooling import PluginManager
 
-CORE_MODULES = ("splatwizard_native.operations:POOL", "splatwizard_native.fused.native:TRAINING")
+CORE_MODULES = ("splatwizard_native.face_operations:POOL", "splatwizard_native.fused.native:TRAINING")
 
 
 def declared_modules(plugins: PluginManager) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from splatwizard_native.operations import operations
+from splatwizard_native import operations
 from sw_gaussians.native import GAUSSIANS as MODULE
 
 __getattr__ = operations(MODULE, __name__)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from splatwizard_native.operations import operations
+from splatwizard_native import operations
 from sw_hac.native import HAC as MODULE
 
 __getattr__ = operations(MODULE, __name__)

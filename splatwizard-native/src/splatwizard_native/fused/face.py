@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
+from splatwizard_native.face_operations import operations
 from splatwizard_native.fused.native import TRAINING as MODULE
-from splatwizard_native.operations import operations
 
 __getattr__ = operations(MODULE, __name__)
