@@ -10,7 +10,10 @@ namespace {
 
 // Ascending, if so asked; each within 0 .. limit - 1.
 void check_places(const int64_t* places, int64_t count, const char* name, int64_t limit, bool ascending) {
-  for (int64_t i = 0; i < count; ++i)
+  bool wrong = false;  // without branches, in vectors
+  for (int64_t i = 0; i < count; ++i) wrong |= places[i] < 0 || places[i] >= limit;
+  for (int64_t i = 1; ascending && i < count; ++i) wrong |= places[i] <= places[i - 1];
+  for (int64_t i = 0; wrong; ++i)
     if (places[i] < 0 || places[i] >= limit || (ascending && i > 0 && places[i] <= places[i - 1]))
       refuse("%s[%lld] is %lld of %lld", name, (long long)i, (long long)places[i], (long long)limit);
 }

@@ -33,9 +33,15 @@ Gaussians slopes_of(const Call& call) {  // read only
 }
 
 void check_drawn(const Anchors& from) {
-  for (int64_t i = 0; i < from.count; ++i)
-    if (from.drawn[i] < (i == 0 ? 0 : from.drawn[i - 1] + 1) || from.drawn[i] >= from.n * from.k)
-      refuse("Gaussian %lld of %lld is drawn out of order", (long long)from.drawn[i], (long long)(from.n * from.k));
+  const auto wrong = [&](int64_t i) {
+    return from.drawn[i] < 0 || from.drawn[i] >= from.n * from.k || (i > 0 && from.drawn[i] <= from.drawn[i - 1]);
+  };
+  bool any = false;  // without branches, in vectors
+  for (int64_t i = 1; i < from.count; ++i) any |= from.drawn[i] <= from.drawn[i - 1];
+  if (from.count == 0 || !(any || wrong(0) || wrong(from.count - 1))) return;
+  int64_t i = 0;
+  while (!wrong(i)) ++i;
+  refuse("Gaussian %lld of %lld is drawn out of order", (long long)from.drawn[i], (long long)(from.n * from.k));
 }
 
 template <class Call>
