@@ -2,6 +2,7 @@
 # make test   set up .venv and run the default tests (no network, no GPU), TEST_JOBS=2 at a time
 # make test-geometry  the tests that need Open3D (100 MB), which it installs; Debian's libraries: sw doctor names them
 # make test-ray  the tests that need Ray (and submitit, for Slurm), which it installs
+# make test-wheels  that our wheels bring their kernels: built, installed and run where no compiler is; a quarter of an hour
 # make docs-site  the pages under docs/ as a site, by mkdocs-material, which it installs
 # make lint   ruff and mypy
 # make bench  speed and memory, as ratios measured in one run
@@ -20,7 +21,7 @@ TEST_JOBS ?= 2
 # Whole files, so that fixtures are made once, in the order of conftest.py: the long ones first.
 TEST_DIST := --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test test-geometry test-ray test-browser test-interchange docs-site coverage lint format bench kernels docs clean
+.PHONY: demo test test-wheels test-geometry test-ray test-browser test-interchange docs-site coverage lint format bench kernels docs clean
 
 demo: $(VENV)/.ready
 	@tools/check-system compiler
@@ -53,6 +54,10 @@ test-interchange: $(VENV)/.ready-dev
 	build/oracle/venv/bin/pip install -q gsply==0.4.6
 	SPLAT_TRANSFORM=build/oracle/node_modules/.bin/splat-transform GSPLY_PYTHON=build/oracle/venv/bin/python \
 		$(BIN)/python -m pytest plugins/sw-interchange/tests/test_other_programs.py $(PYTEST_ARGS)
+
+test-wheels: $(VENV)/.ready-dev
+	$(PIP) install -q ziglang
+	$(BIN)/python -m pytest -m slow tests/test_without_compiler.py tests/test_wasm_sources.py $(PYTEST_ARGS)
 
 docs-site: $(VENV)/.ready-dev
 	$(PIP) install -q -c constraints.txt mkdocs-material

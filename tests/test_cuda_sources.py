@@ -11,7 +11,8 @@ from sw_doctor.declared_modules import declared_modules
 from splatwizard_core.plugins import load_plugins
 from splatwizard_native import find_nvcc, toolchain
 
-MODULES = [resolve_module(target) for target in declared_modules(load_plugins())]
+DECLARED = [resolve_module(target) for target in declared_modules(load_plugins())]
+MODULES = [*DECLARED, *(module.cuda for module in DECLARED if module.cuda is not None)]
 SOURCES = [(module, source) for module in MODULES for source in module.cuda_sources if source.endswith(".cu")]
 NVCC = find_nvcc()
 

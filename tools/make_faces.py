@@ -50,7 +50,7 @@ def stub(path: Path) -> str:
     for _, name in OPERATION.findall(header):
         fields = structs[f"{name}_call"]
         counts = counts_of(fields)
-        lines += [*([""] if lines[-1][:1] == " " else []), f"def {name}(", "    *,"]
+        lines += [*([""] if not lines or lines[-1][:1] == " " else []), f"def {name}(", "    *,"]
         for f in fields:
             may_be_left_out = f.optional or f.name in counts
             if not f.out:

@@ -2,11 +2,13 @@
 
 import ctypes
 import json
+import subprocess
 
 import pytest
 import torch
 from native_package import digest_of, needs_compiler
 
+from splatwizard_native import find_compiler
 from splatwizard_native.face import Field, read_structs
 from splatwizard_native.face_operations import operations
 
@@ -97,6 +99,8 @@ def test_a_header_is_read_by_lines():
     assert by_name["seen"].out
     with pytest.raises(ValueError, match=r"struct sum_call: 'some_type x;' is no field"):
         read_structs(HEADER.replace("double factor;", "some_type x;"))
+    with pytest.raises(ValueError, match=r"struct sum_call: 'size' is a field of the head"):
+        read_structs("typedef struct {\n  int64_t size;\n} sum_call;\n")
 
 
 @needs_compiler
@@ -159,6 +163,14 @@ def test_strided_rows_are_taken_where_the_header_says_so(offered):
         offered.sum(**arguments(), loose=torch.zeros(2, 4))
 
 
+OF_ANOTHER_ABI = """
+unsigned answer_abi(void) { return 2; }
+const char* answer_hash(void) { return "%s"; }
+const char* answer_last_error(void) { return ""; }
+int answer_sum(void* call) { return 0; }
+"""
+
+
 def broken(library, damage: str) -> None:
     """Break a library so that its digest still fits, as a wheel of another platform or release has it."""
     content = library.read_bytes()
@@ -171,13 +183,17 @@ def broken(library, damage: str) -> None:
     elif damage == "other sources":
         content = content.replace(b"answer_hash", b"answer_hush")
     library.write_bytes(content)
+    if damage == "another ABI":
+        source = library.with_suffix(".c")
+        source.write_text(OF_ANOTHER_ABI % library.stem.rpartition("-")[2])
+        subprocess.run([*find_compiler(), "-x", "c", "-shared", "-fPIC", source, "-o", library], check=True)
     if damage != "truncated":
         facts = library.with_suffix(".json")
         facts.write_text(json.dumps({**json.loads(facts.read_text()), "sha256": digest_of(library)}))
 
 
 @needs_compiler
-@pytest.mark.parametrize("damage", ["another platform", "truncated", "missing symbol", "other sources"])
+@pytest.mark.parametrize("damage", ["another platform", "another ABI", "truncated", "missing symbol", "other sources"])
 def test_a_broken_prebuilt_library_costs_one_line_and_the_next_one_is_taken(module, package, caplog, damage):
     prebuilt = module.build(folder=module.prebuilt_folder)
     cached = module.build()
@@ -187,6 +203,7 @@ def test_a_broken_prebuilt_library_costs_one_line_and_the_next_one_is_taken(modu
     assert fresh.state()["path"] == str(cached)
     assert [record.levelname for record in caplog.records] == ["WARNING"]
     assert str(prebuilt) in caplog.text
+    assert damage != "another ABI" or "it is of ABI 2 and sources" in caplog.text
 
 
 @needs_compiler

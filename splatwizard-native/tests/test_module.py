@@ -14,7 +14,7 @@ from splatwizard_native import NativeBuildError
 def test_the_first_load_compiles_with_a_line_of_progress_and_the_second_finds_the_cache(package):
     said: list[str] = []
     first = package.module()
-    assert first.state()["state"] == "not built"
+    assert first.state()["state"] == "reference"
     first.load(say=said.append)
     assert said[0] == "compiling kernels 'answer' (once) ..."
     assert package.compilations == 1
@@ -22,7 +22,7 @@ def test_the_first_load_compiles_with_a_line_of_progress_and_the_second_finds_th
     second.load(say=said.append)
     assert package.compilations == 1
     assert len(said) == 2
-    assert second.state()["state"] == "cached"
+    assert second.state()["state"] == "built"
     assert call(second.state()["path"]) == 42
 
 

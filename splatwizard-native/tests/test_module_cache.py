@@ -75,7 +75,7 @@ def test_a_damaged_library_is_rebuilt(package, damage):
 def test_available_and_state_compile_nothing(package):
     module = package.module()
     assert module.available() is None
-    assert module.state() == {"state": "not built", "path": None, "target": "cpu"}
+    assert module.state() == {"state": "reference", "path": None, "target": "cpu"}
     assert package.compilations == 0
 
 
@@ -116,7 +116,7 @@ def test_load_built_takes_what_is_there_and_compiles_nothing(package):
     package.module().build()
     module = package.module()
     assert module.load_built() is True
-    assert module.state()["state"] == "cached"
+    assert module.state()["state"] == "built"
     assert package.compilations == 1
 
 

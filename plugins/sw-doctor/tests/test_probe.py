@@ -68,7 +68,7 @@ def kernels(tmp_path, monkeypatch) -> NativeModule:
 
 
 def test_kernels_that_are_not_built_are_missing_and_stay_so(kernels, tmp_path):
-    found = probe.check_kernels("doctored_kernels:MODULE")
+    (found,) = probe.check_kernels("doctored_kernels:MODULE")
     assert (found.state, found.mend) == ("missing", "sw build-kernels")
     assert "about" not in found.detail  # nothing was measured here so far
     assert "it is slow" in found.detail
@@ -79,18 +79,18 @@ def test_damaged_kernels_are_broken(kernels):
     library = kernels._library(kernels.cache_folder, "native")
     library.parent.mkdir(parents=True)
     library.write_bytes(b"half a libr")
-    found = probe.check_kernels("doctored_kernels:MODULE")
+    (found,) = probe.check_kernels("doctored_kernels:MODULE")
     assert (found.state, found.mend) == ("broken", "sw build-kernels --force")
 
 
 def test_kernels_that_are_switched_off_say_so(kernels, monkeypatch):
     monkeypatch.setenv("SPLATWIZARD_NATIVE", "0")
-    found = probe.check_kernels("doctored_kernels:MODULE")
+    (found,) = probe.check_kernels("doctored_kernels:MODULE")
     assert (found.state, found.mend) == ("missing", "unset SPLATWIZARD_NATIVE")
 
 
 def test_a_native_module_that_cannot_be_imported_is_broken():
-    assert probe.check_kernels("no_such_module:MODULE").state == "broken"
+    assert probe.check_kernels("no_such_module:MODULE")[0].state == "broken"
 
 
 def manager(site: Path, name: str, source: str) -> PluginManager:

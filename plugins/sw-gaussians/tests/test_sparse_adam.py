@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from sw_gaussians import face
 from sw_gaussians.fast import sparse_adam as module
 from sw_gaussians.native import GAUSSIANS
 from sw_gaussians.sparse_adam import SparseSplatOptimizer, sparse_adam, sparse_adam_steps
@@ -118,6 +119,18 @@ def test_wrong_arguments_are_refused():
     x = torch.zeros(4, 3)
     with pytest.raises(ShapeError, match=r"rows is \[5\], the parameter \[4, 3\]: it must be \[4\]"):
         sparse_adam(x, x, x.clone(), x.clone(), torch.ones(5, dtype=torch.bool), lr=1, **OPTIONS)
+
+
+def test_the_kernel_refuses_what_is_no_mask_or_no_row():
+    if not GAUSSIANS.try_load():
+        pytest.skip(f"no compiled kernels: {GAUSSIANS.available()}")
+    x = torch.zeros(4, 3)
+    with pytest.raises(RuntimeError, match="marked must be a contiguous bool tensor"):
+        sparse_adam(x, x, x.clone(), x.clone(), torch.ones(4), lr=1, **OPTIONS)
+    updates = (face.sparse_update * 1)((*[x.data_ptr()] * 4, -3, 1.0, BETA1, BETA2, EPS))
+    with pytest.raises(RuntimeError, match="update 0 has rows of -3 numbers"):
+        face.sparse_adam(updates=updates, count=1, marked=torch.ones(4, dtype=torch.bool))
+    assert (x == 0).all()
 
 
 def made(n: int = 12) -> tuple[GaussianModel, SplatOptimizer]:

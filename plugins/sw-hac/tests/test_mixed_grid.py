@@ -6,6 +6,7 @@ import torch
 from splatwizard_core.base.random_states import seeded
 from splatwizard_core.plugins import load_plugins
 from sw_codecs.exact_native import EXACT
+from sw_codecs.fast import kernel_operations
 from sw_codecs.native import CODECS
 from sw_codecs.testing import check_context_model
 from sw_hac.fast import sign_lookup
@@ -145,12 +146,12 @@ def test_gradients_of_signs_are_the_same_bits_for_any_number_of_threads():
 def test_places_and_tables_of_signs_that_do_not_fit_are_refused():
     CODECS.load()
     levels = ([2.0], [3], [0], [1], 9)
-    look_up, x = torch.ops.sw_codecs.signs_lookup, torch.zeros(2, 3)
+    look_up, x = kernel_operations.signs_lookup, torch.zeros(2, 3)
     for axes, table, found, first, said in (
         ([0, 3], (16, 2), (2, 2), 0, "no axis 3"),
         ([0, 1], (15, 2), (2, 2), 0, "ends at entry 16 of 15"),
         ([0, 1], (16, 2), (2, 3), 2, "features do not fit"),
-        ([0, 1], (16, 2), (1, 2), 0, "features must be contiguous"),
+        ([0, 1], (16, 2), (1, 2), 0, "found must be a contiguous"),
         ([0, 1], (16, 9), (2, 9), 0, "1 to 8"),
     ):
         with pytest.raises(RuntimeError, match=said):

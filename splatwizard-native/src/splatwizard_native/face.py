@@ -54,6 +54,8 @@ def read_structs(header: str) -> dict[str, list[Field]]:
             match = FIELD.fullmatch(line)
             if match is not None and (match[2] or match[1] in NUMBERS):
                 fields += _fields(*match.groups())
+                if any(fields[-1].name == taken for taken, _ in HEAD):
+                    raise ValueError(f"struct {name}: '{fields[-1].name}' is a field of the head")
             elif line.partition("//")[0].strip() not in ("", "sw_head head;"):
                 raise ValueError(f"struct {name}: '{line.strip()}' is no field")
         found[name] = fields

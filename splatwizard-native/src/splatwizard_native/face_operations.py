@@ -1,4 +1,4 @@
-"""What the operations of native modules run on: the threads that all share, and the functions of their libraries."""
+"""Operations of native modules as Python functions, and the threads that all of them share."""
 
 from __future__ import annotations
 

@@ -189,15 +189,15 @@ class NativeModule:
         return None
 
     def state(self) -> dict[str, Any]:
-        """Facts for `sw doctor`: state (prebuilt, cached, damaged, not built), path, target (cpu, cuda).
+        """Facts for `sw doctor`: state (prebuilt, built, damaged, reference), path, target (cpu, cuda).
 
         damaged: there is a library for this machine and these sources, but not the one that the build wrote.
         """
         path = self._session.loaded or next(self._existing(), None)
         if path is not None:
-            state = "prebuilt" if path.parent == self.prebuilt_folder else "cached"
+            state = "prebuilt" if path.parent == self.prebuilt_folder else "built"
         else:
-            state = "damaged" if any(library.exists() for library in self._places()) else "not built"
+            state = "damaged" if any(library.exists() for library in self._places()) else "reference"
         cuda = self._with_cuda() if path is None else bool(architectures_of(path))
         return {"state": state, "path": None if path is None else str(path), "target": "cuda" if cuda else "cpu"}
 
@@ -251,16 +251,15 @@ class NativeModule:
         cuda        with CUDA kernels or without; None: as a build here would be
         any_gpu     leave the GPUs' architectures out: a binary in a package says itself which ones it holds
         """
-        import torch
-
         cuda = self._with_cuda() if cuda is None else cuda
+        torch = None if self.face else importlib.import_module("torch")  # a library with a face is built without it
         # The empty flags at the two ends are those of linker and nvcc: modules had some, and older builds stay valid.
         facts: list[object] = [
-            self.name, f"ABI {ABI}" if self.face else str(torch.__version__), self._common_flags(), platform.system(),
-            platform.machine(), march,
+            self.name, f"ABI {ABI}" if torch is None else str(torch.__version__), self._common_flags(),
+            platform.system(), platform.machine(), march,
             toolchain.arch_variants(march), toolchain.cpu_identity() if march == "native" else "", self.cflags, (),
         ]  # fmt: skip
-        if cuda:
+        if cuda and torch is not None:
             facts += [torch.version.cuda, () if any_gpu else cuda_toolkit.architectures(), ()]
         return self._digest(facts, self._files(cuda))
 
@@ -314,15 +313,19 @@ class NativeModule:
 
     def _places(self) -> Iterator[Path]:
         """Places of a library for this machine and these sources, best first."""
-        import torch
-
         # One without CUDA only where none with it can be built: else an old build would hide the GPU for ever.
-        prebuilt_for_cuda = self.cuda_sources and torch.version.cuda is not None
+        prebuilt_for_cuda = self.cuda_sources and importlib.import_module("torch").version.cuda is not None
         wanted = (True,) if self._with_cuda() else (True, False) if prebuilt_for_cuda else (False,)
         for cuda, folder, march in itertools.product(wanted, (self.prebuilt_folder, self.cache_folder), MARCHES):
             yield self._library(folder, march, cuda)
 
+    def prebuilt_name(self, march: str) -> str:
+        """File name in a package of a library with a face: the wheel around it tells for which machine."""
+        return f"{self.name}-{march}-{self.source_hash()}.so"
+
     def _library(self, folder: Path, march: str, cuda: bool | None = None) -> Path:
+        if self.face and folder == self.prebuilt_folder:
+            return folder / self.prebuilt_name(march)
         return folder / f"{self.name}-{self.key(march, cuda, any_gpu=folder == self.prebuilt_folder)}.so"
 
     def _root(self) -> Path:
@@ -384,7 +387,7 @@ class NativeModule:
         return jobs
 
     def _kept(self, jobs: Sequence[Job], compiler: str) -> list[Path]:
-        """Where objects are kept, by all that they depend on, so that one changed file is compiled alone."""
+        """Places of objects, by all that they depend on, so that one changed file is compiled alone."""
         headers = [path for path in self._files(self._with_cuda()) if path.suffix == ".h"]
         folder, torchs = self.cache_folder / "objects", "" if self.face else importlib.metadata.version("torch")
         places = []
@@ -405,11 +408,12 @@ class NativeModule:
             jobs = self._jobs(march, Path(scratch))
             kept = dict(zip(jobs, self._kept(jobs, tools.version()), strict=True))
             missing = [job for job, place in kept.items() if force or not fetch(place, job.output)]
-            built = Path(scratch) / library.name
+            built, shown = Path(scratch) / library.name, Path(scratch) / "shown"
+            shown.write_text(f"{{ global: {self.name}_*; local: *; }};\n", "utf-8")
             try:
                 tools.compile(missing, build_log)
                 self._check_headers(missing)
-                plain = toolchain.plain_libraries(march) if self.face else toolchain.torch_libraries(cuda=cuda)
+                plain = toolchain.plain_libraries(march, shown) if self.face else toolchain.torch_libraries(cuda=cuda)
                 tools.link([j.output for j in jobs], built, build_log, plain)
             except NativeBuildError as error:
                 raise NativeBuildError(f"\n{error}\nfull log: {build_log}") from error

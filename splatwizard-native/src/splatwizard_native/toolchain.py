@@ -109,13 +109,13 @@ def torch_include_flags(*, cuda: bool) -> tuple[str, ...]:
 
 
 def arch_variants(march: str) -> dict[str, tuple[str, ...]]:
-    """Kernel namespace -> flags, for march "native" (this machine) or "portable" (any machine of this kind)."""
-    x86 = platform.machine() in ("x86_64", "AMD64")
+    """Kernel namespace -> flags. march: "native" (this machine), "portable" (any of its kind), "x86_64", "aarch64"."""
+    machine = "x86_64" if platform.machine() == "AMD64" else platform.machine()
     if march == "native":
-        return {"arch_native": ("-march=native", "-mprefer-vector-width=512") if x86 else ("-march=native",)}
-    if march == "portable":
-        return dict(X86_LEVELS) if x86 else {"arch_native": ()}
-    raise ValueError(f"march is '{march}'; it must be 'native' or 'portable'")
+        return {"arch_native": ("-march=native", *(("-mprefer-vector-width=512",) if machine == "x86_64" else ()))}
+    if march == "portable" or march in ("x86_64", "aarch64"):
+        return dict(X86_LEVELS) if (machine if march == "portable" else march) == "x86_64" else {"arch_native": ()}
+    raise ValueError(f"march is '{march}'; it must be 'native', 'portable', 'x86_64' or 'aarch64'")
 
 
 class Toolchain:
@@ -179,10 +179,10 @@ def torch_libraries(*, cuda: bool) -> list[str]:
     return [*runtime_libraries(), *extra, *libraries]
 
 
-def plain_libraries(march: str) -> list[str]:
-    """Return what links a library with a plain C face: a portable one brings its C++ runtime, and shows none of it."""
-    if march == "portable" and sys.platform == "linux":
-        return ["-pthread", "-static-libstdc++", "-static-libgcc", "-Wl,--exclude-libs,ALL"]
+def plain_libraries(march: str, shown: Path) -> list[str]:
+    """Return what links a library with a plain C face: a portable one brings its C++ runtime, shows a list."""
+    if march != "native" and sys.platform == "linux":
+        return ["-pthread", "-static-libstdc++", "-static-libgcc", f"-Wl,--version-script={shown}", "-Wl,-s"]
     return [*runtime_libraries(), "-pthread"]
 
 

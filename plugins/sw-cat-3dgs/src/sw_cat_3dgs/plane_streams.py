@@ -26,6 +26,7 @@ from sw_codecs.bits import checksum
 from sw_codecs.bits.packing import ByteReader, write_varint
 from sw_codecs.entropy import exact_streams
 from sw_codecs.exact_native import EXACT
+from sw_codecs.fast import exact_operations
 
 SMALLEST_STREAM = 16_384
 """Integers that a stream has on average, if it could have more: it costs some eight bytes."""
@@ -40,7 +41,7 @@ def encode(planes: Sequence[np.ndarray], models: Sequence[PlaneModel]) -> bytes:
     weights, parts = weights_of(models), parts_of(len(models), shapes, channels)
     values = [np.ascontiguousarray(plane, np.int32) for plane in planes]
     if _compiled(shapes, weights):
-        data, sizes = torch.ops.sw_codecs_exact.encode_planes(
+        data, sizes = exact_operations.encode_planes(
             exact_streams.share_tables("laplace"), _tensors(values), torch.from_numpy(parts), weights
         )
         content, table = data.numpy().tobytes(), sizes.numpy()
@@ -67,7 +68,7 @@ def decode(data: bytes, shapes: Sequence[Shape], models: Sequence[PlaneModel]) -
     content = reader.take(reader.left)
     if _compiled(shapes, weights):
         found = [np.zeros((len(models), *shape), np.int32) for shape in shapes]
-        status = torch.ops.sw_codecs_exact.decode_planes(
+        status = exact_operations.decode_planes(
             exact_streams.share_tables("laplace"), torch.from_numpy(np.frombuffer(content, np.uint8).copy()),
             torch.from_numpy(sizes), _tensors(found), torch.from_numpy(parts), weights,
         )  # fmt: skip

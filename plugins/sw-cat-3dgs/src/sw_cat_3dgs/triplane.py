@@ -15,6 +15,7 @@ from torch.nn.functional import grid_sample
 
 from sw_cat_3dgs.principal_frame import UNIT
 from sw_codecs.exact_native import EXACT
+from sw_codecs.fast import exact_operations
 from sw_codecs.quantizers.straight_through import straight_through
 
 PAIRS = ((0, 1), (0, 2), (1, 2))
@@ -94,7 +95,7 @@ class Triplane(nn.Module):
         if _kernel_takes(corners) and EXACT.try_load():
             small = [each.to(torch.int32) for each in corners]
             sizes = [plane.shape[-1] for plane in integers]
-            return lambda places: torch.ops.sw_codecs_exact.triplane_features(places.contiguous(), small, sizes)
+            return lambda places: exact_operations.triplane_features(places.contiguous(), small, sizes)
         return lambda places: _exact_rows(integers, corners, places)
 
 

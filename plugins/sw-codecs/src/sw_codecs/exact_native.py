@@ -7,10 +7,12 @@ from splatwizard_native import NativeBuildError, NativeModule
 EXACT = NativeModule(
     name="sw_codecs_exact",
     package="sw_codecs",
+    face="exact_kernels/face.h",
     sources=(
-        "exact_kernels/binding.cpp",
-        "exact_kernels/binding_networks.cpp",
-        "exact_kernels/binding_mixtures.cpp",
+        "exact_kernels/face.cpp",
+        "exact_kernels/face_mixtures.cpp",
+        "exact_kernels/face_networks.cpp",
+        "exact_kernels/face_planes.cpp",
     ),
     kernels=(
         "exact_kernels/lattice.cpp",

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from splatwizard_native import NativeModule
 
+# A place is rounded as torch rounds it; no trap of a comparison keeps loops out of vector code.
+CFLAGS = ("-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math")
+
 CODECS = NativeModule(
     name="sw_codecs",
     package="sw_codecs",
-    sources=(
-        "kernels/binding.cpp",
-        "kernels/binding_sites.cpp",
-        "kernels/binding_cuda.cpp",
-        "kernels/binding_planes.cpp",
-    ),
+    face="kernels/face.h",
+    sources=("kernels/face.cpp",),
     kernels=(
         "kernels/grid.cpp",
         "kernels/signs.cpp",
@@ -20,15 +19,30 @@ CODECS = NativeModule(
         "kernels/huffman.cpp",
         "kernels/nearest.cpp",
     ),
-    headers=("kernels/*.h", "kernels/cuda/*.h"),
-    cuda_sources=(
-        "kernels/cuda/grid.cu",
-        "kernels/cuda/signs.cu",
-        "kernels/cuda/plane_bits.cu",
-        "kernels/cuda/triplane.cu",
-    ),
-    # A place is rounded as torch rounds it; no trap of a comparison keeps loops out of vector code.
-    cflags=("-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"),
+    headers=("kernels/face.h", "kernels/grid.h", "kernels/kernels.h", "kernels/levels.h", "kernels/sites.h"),
+    cflags=CFLAGS,
     without="hash grids and planes are looked up by torch operations, Huffman codes decoded by a loop, codebooks "
     "searched whole: slower",
+    cuda=NativeModule(
+        name="sw_codecs_cuda",
+        package="sw_codecs",
+        sources=("kernels/binding_cuda.cpp", "kernels/binding_planes.cpp"),
+        headers=(
+            "kernels/binding.h",
+            "kernels/grid.h",
+            "kernels/levels.h",
+            "kernels/plane_bits.h",
+            "kernels/sums.h",
+            "kernels/triplane.h",
+            "kernels/cuda/*.h",
+        ),
+        cuda_sources=(
+            "kernels/cuda/grid.cu",
+            "kernels/cuda/signs.cu",
+            "kernels/cuda/plane_bits.cu",
+            "kernels/cuda/triplane.cu",
+        ),
+        cflags=CFLAGS,
+        without="hash grids and planes are looked up by torch operations: slower",
+    ),
 )

@@ -9,6 +9,7 @@ from splatwizard_core.base.random_states import seeded
 from sw_codecs.context.fast import grid_lookup
 from sw_codecs.context.fast.grid_lookup import fits
 from sw_codecs.context.hash_grid import HashGrid
+from sw_codecs.fast import kernel_operations
 from sw_codecs.native import CODECS
 
 needs_kernels = pytest.mark.skipif(CODECS.available() is not None, reason=str(CODECS.available()))
@@ -112,7 +113,7 @@ def test_levels_that_do_not_fit_the_table_are_refused(change, said):
     CODECS.load()
     levels = {"scales": [3.0, 3.0], "lasts": [3, 3], "starts": [0, 64], "dense": [1, 1], "log2_size": 9, **change}
     with pytest.raises(RuntimeError, match=said):
-        torch.ops.sw_codecs.lookup(torch.zeros(1, 3), torch.zeros(128, 2), *levels.values())
+        kernel_operations.lookup(torch.zeros(1, 3), torch.zeros(128, 2), *levels.values())
 
 
 @pytest.mark.cuda

@@ -51,7 +51,7 @@ def steps() -> Iterator[tuple[str, Step]]:
     theirs = {t for registry in plugins.registries.values() for e in registry if e.foreign for t in _native(e)}
     targets = declared_modules(plugins)
     for target in [t for t in targets if t not in theirs]:
-        yield target, lambda target=target: [check_kernels(target)]  # type: ignore[misc]
+        yield target, lambda target=target: check_kernels(target)  # type: ignore[misc]
     yield "sw run", lambda: [check_main_job(plugins)]
     yield "rasterizers", lambda: check_rasterizers(plugins)
     yield "entries", lambda: check_entries(plugins)
@@ -59,7 +59,7 @@ def steps() -> Iterator[tuple[str, Step]]:
     for info in (each for each in plugins.plugins if each.foreign):
         yield f"entries{OF}{info.distribution}", lambda info=info: check_theirs(plugins, info)  # type: ignore[misc]
     for target in [t for t in targets if t in theirs]:
-        yield target, lambda target=target: [check_kernels(target)]  # type: ignore[misc]
+        yield target, lambda target=target: check_kernels(target)  # type: ignore[misc]
     yield "scenes", lambda: [check_scenes(plugins)]
 
 
@@ -147,16 +147,23 @@ def nvidia_driver() -> str | None:
     return None
 
 
-def check_kernels(target: str) -> Check:
-    """Load a native module if it is built; it compiles nothing."""
+def check_kernels(target: str) -> list[Check]:
+    """Load a native module, and its kernels of CUDA where torch has it, if they are built; it compiles nothing."""
+    import torch
+
     try:
         module = pkgutil.resolve_name(target)
     except (Exception, SystemExit) as error:
         why = one_line(f"cannot be imported: {type(error).__name__}: {error}")
-        return Check("kernels", target, "broken", why, "install the package again")
+        return [Check("kernels", target, "broken", why, "install the package again")]
     if not isinstance(module, NativeModule):
         detail = f"it is not a NativeModule but {type(module).__name__}"
-        return Check("kernels", target, "broken", detail, "install the package again")
+        return [Check("kernels", target, "broken", detail, "install the package again")]
+    of_cuda = module.cuda if torch.version.cuda is not None else None
+    return [_check_module(each) for each in (module, of_cuda) if each is not None]
+
+
+def _check_module(module: NativeModule) -> Check:
     build = "sw build-kernels"
     try:
         facts = module.state()
@@ -166,12 +173,14 @@ def check_kernels(target: str) -> Check:
         mend = "unset SPLATWIZARD_NATIVE" if switched_off else f"{build} --force"
         return Check("kernels", module.name, "missing" if switched_off else "broken", one_line(error), mend)
     if loaded:
-        detail = f"{facts['state']} build for {facts['target']}, loaded"
+        detail = f"{facts['state']} for {facts['target']}, loaded"
         return Check("kernels", module.name, "ok", detail, facts=facts)
     if facts["state"] == "damaged":
         detail = "the build in the cache is damaged"
         return Check("kernels", module.name, "broken", detail, f"{build} --force", facts=facts)
-    detail = f"not built; compiled when first used. Without: {module.without}"
+    reason = module.available(cuda=bool(module.cuda_sources))
+    when = "compiled when first used" if reason is None else one_line(reason)
+    detail = f"reference: not built; {when}. Without: {module.without}"
     return Check("kernels", module.name, "missing", detail, build, facts=facts)
 
 
@@ -253,7 +262,7 @@ def _with_command_apart(why: str) -> tuple[str, str | None]:
 
 def _lacking_kernels(entry: Entry) -> Check | None:
     """Finding about a native module that this rasterizer needs and that did not load; None if all did."""
-    checks = [check_kernels(target) for target in _native(entry)]
+    checks = [check_kernels(target)[0] for target in _native(entry)]
     return next((check for check in checks if check.state != "ok"), None)
 
 

@@ -7,10 +7,18 @@ from splatwizard_native import NativeModule
 GAUSSIANS = NativeModule(
     name="splatwizard_gaussians",
     package="sw_gaussians",
-    sources=("kernels/binding.cpp", "kernels/binding_cuda.cpp"),
+    face="kernels/face.h",
+    sources=("kernels/face.cpp",),
     kernels=("kernels/sparse_adam.cpp",),
-    headers=("kernels/*.h", "kernels/cuda/*.h"),
-    cuda_sources=("kernels/cuda/statistics.cu", "kernels/cuda/sparse_adam.cu", "kernels/cuda/disagreement.cu"),
+    headers=("kernels/*.h",),
     cflags=("-fno-math-errno", "-fno-trapping-math"),  # without these GCC keeps sqrt and division out of vector code
-    without="sparse Adam, gradient statistics and normal losses run on torch operations: the same numbers, slower",
+    without="sparse Adam runs on torch operations: the same numbers, slower",
+    cuda=NativeModule(
+        name="splatwizard_gaussians_cuda",
+        package="sw_gaussians",
+        sources=("kernels/binding_cuda.cpp",),
+        headers=("kernels/cuda/*.h",),
+        cuda_sources=("kernels/cuda/statistics.cu", "kernels/cuda/sparse_adam.cu", "kernels/cuda/disagreement.cu"),
+        without="sparse Adam, gradient statistics and normal losses run on torch operations: the same numbers, slower",
+    ),
 )

@@ -2,15 +2,14 @@
 
 import pytest
 import torch
-from sw_anchors.fast import sample_bits
-from sw_anchors.native import ANCHORS
 
 from sw_codecs.entropy import further_rates, rates
-from sw_hac.fast.predicted_bits import MaskKind, Predicted, mixture_bits
+from sw_hac.fast.predicted_bits import MaskKind, Predicted, have_kernels, mixture_bits
+from sw_hac.native import HAC
 from sw_hac_plus.channel_mixture import ChannelMixture
 from sw_hac_plus.fast.channel_networks import ChannelNetworks
 
-ON_CUDA = ANCHORS.available(cuda=True)
+ON_CUDA = HAC.available(cuda=True)
 DEVICES = [
     "cpu",
     pytest.param("cuda", marks=[pytest.mark.cuda, pytest.mark.skipif(ON_CUDA is not None, reason=str(ON_CUDA))]),
@@ -99,7 +98,7 @@ def both(kind, slices, k, count, *, device="cpu", masks=MaskKind.GATED_MEAN, flo
         if channel is not None:
             channel = channel.to(device, dtype)
             networks, parameters = ChannelNetworks(channel, units.device), ChannelNetworks.parameters(channel)
-        assert sample_bits.fits(*leaves, counted, *parameters) == (dtype == torch.float32)
+        assert have_kernels(*leaves, counted, *parameters) == (dtype == torch.float32)
         if dtype == torch.float32:
             bits, by_group = mixture_bits(*leaves, counted, predicted, networks, tuple(parameters))
         else:
@@ -212,14 +211,16 @@ def test_slices_that_leave_a_channel_out_are_refused(starts):
         ChannelNetworks(channel, torch.device("cpu"))
 
 
-@pytest.mark.parametrize("change", ["outputs", "units", "kind"])
-def test_tensors_of_wrong_sizes_are_refused(change):
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [("outputs", "20 outputs are too few for 16 numbers"), ("units", r"units .* \[39\] "), ("kind", "no kind 7")],
+)
+def test_tensors_of_wrong_sizes_are_refused(change, said):
     x, outputs, steps, masks, counted, units = sample_of(5, 4, 2)
     kind = 7 if change == "kind" else 1
-    outputs = outputs[:, :20].contiguous() if change == "outputs" else outputs
-    units = units[:-1].contiguous() if change == "units" else units
-    ANCHORS.load()
-    with pytest.raises(RuntimeError, match="sw_anchors"):
-        torch.ops.sw_anchors.mixture_bits(
-            x, outputs, units, None, None, steps, masks, counted, 1.0, 1e-6, 1e-9, 0.0, kind
-        )
+    if change == "outputs":
+        outputs, units = outputs[:, :20], units[:20]
+    units = units[:-1] if change == "units" else units
+    predicted = Predicted(units, 1.0, 1e-6, 1e-9, 0.0, kind)
+    with pytest.raises(RuntimeError, match=f"^mixture_bits: .*{said}"):
+        mixture_bits(x, outputs, steps, masks, counted, predicted)

@@ -28,5 +28,5 @@ def register_methods(registry: Registry[Any]) -> None:
                  summary="anchors whose attributes a binary hash grid predicts (Chen et al. 2024)",
                  presets=["paper", "quick"],
                  rates=["r1", "r2", "r3", "r4", "r5"], bd_anchor=1,
-                 native=["sw_anchors.native:ANCHORS", "sw_codecs.native:CODECS"],
+                 native=["sw_anchors.native:ANCHORS", "sw_codecs.native:CODECS", "sw_hac.native:HAC"],
                  published="sw_hac:published.toml")  # fmt: skip

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pkgutil
+from collections.abc import Iterable
 from functools import partial
 from typing import Any
 
@@ -9,6 +11,7 @@ import click
 
 from splatwizard_core.cli import options as shared
 from splatwizard_core.plugins import load_plugins
+from splatwizard_core.plugins.registry import Entry
 
 
 @click.command("list-plugins", short_help="what is installed, what is broken and why")
@@ -36,6 +39,7 @@ def gather() -> dict[str, Any]:
                 {"kind": e.kind, "name": e.name, "summary": e.summary, "target": e.target, **dict(e.declared)}
                 for e in plugins.provided_by(info)
             ],
+            "kernels": {} if info.foreign else _kernels(info.module, plugins.provided_by(info)),
             "refused": [{"kind": e.kind, "name": e.name, "reason": why} for e, why in plugins.refused_of(info)],
         }
         for info in plugins.plugins
@@ -46,6 +50,15 @@ def gather() -> dict[str, Any]:
         for name, entries in registry.clashes.items()
     ]
     return {"plugins": rows, "clashes": clashes, "commands": [entry.name for entry in command_entries()]}
+
+
+def _kernels(plugin: str, entries: Iterable[Entry]) -> dict[str, str]:
+    """Collect the states of the native modules of a plugin's package: prebuilt, built, damaged, or reference."""
+    declared = [entry.declared.get("native") or () for entry in entries]
+    targets = [target for each in declared for target in ([each] if isinstance(each, str) else each)]
+    ours = [target for target in dict.fromkeys(targets) if target.partition(".")[0] == plugin.partition(".")[0]]
+    modules = [pkgutil.resolve_name(target) for target in ours]
+    return {module.name: module.state()["state"] for module in modules if module.face}  # others need torch
 
 
 def _print(found: dict[str, Any], *, verbose: bool) -> None:
@@ -62,6 +75,8 @@ def _print(found: dict[str, Any], *, verbose: bool) -> None:
         lines = [f"[bold]{kind}[/bold]: {', '.join(names)}" for kind, names in by_kind.items()]
         if verbose:
             lines = [f"[bold]{e['kind']}[/bold] {escape(e['name'])}: {escape(e['summary'])}" for e in row["provides"]]
+        if row["kernels"]:
+            lines.append(f"[bold]kernels[/bold]: {', '.join(f'{n} ({state})' for n, state in row['kernels'].items())}")
         if row["error"]:
             lines.append(f"[red]broken: {escape(row['error'])}[/red]")
         for each in row["refused"]:

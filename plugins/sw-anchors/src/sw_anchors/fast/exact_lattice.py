@@ -15,6 +15,7 @@ from sw_codecs.context.integer_mlp import IntegerMlp, for_kernel
 from sw_codecs.entropy.exact_tables import exact_tables
 from sw_codecs.entropy.rows import RowLattice
 from sw_codecs.exact_native import EXACT
+from sw_codecs.fast import exact_operations
 
 
 class Network(Protocol):
@@ -36,11 +37,12 @@ def on_lattice(
     number = [torch.empty(n, c, dtype=torch.int16) for c in columns]
     steps = torch.empty(n, len(columns), dtype=torch.int64)
     multipliers = torch.from_numpy(exact_tables().multipliers + of.step_offset)
-    thresholds, weights, start = torch.from_numpy(exact_tables().thresholds), of.network.tensors(), 0
+    thresholds, start = torch.from_numpy(exact_tables().thresholds), 0
+    layers = of.network.flat(), of.network.widths
     for part in parts_of(places, width, MAX_EXACT_NUMBERS) if n else ():
         at = slice(start, start + len(part))
         into = [c[at] for c in centre], [c[at] for c in number], steps[at]
-        if torch.ops.sw_codecs_exact.forecast([for_kernel(features(part))], weights, multipliers, thresholds, *into):
+        if exact_operations.forecast([for_kernel(features(part))], *layers, multipliers, thresholds, *into):
             return None  # out of range: whoever codes the numbers says so
         start += len(part)
     return {group: RowLattice(centre[i], number[i], steps[:, i : i + 1]) for i, group in enumerate(GROUPS)}

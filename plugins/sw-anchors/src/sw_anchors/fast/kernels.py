@@ -7,15 +7,15 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from splatwizard_native import fast_enabled
+from splatwizard_native import NativeModule, fast_enabled
 from sw_anchors.native import ANCHORS
 
 
-def fit_kernels(tensor: Tensor, *others: Tensor | None) -> bool:
+def fit_kernels(tensor: Tensor, *others: Tensor | None, module: NativeModule = ANCHORS) -> bool:
     """Whether there are kernels for float32 tensors on the device of the first, CPU or CUDA; loads them."""
     if not fast_enabled() or any(t is not None and t.dtype != torch.float32 for t in (tensor, *others)):
         return False
-    return ANCHORS.has_cuda() if tensor.is_cuda else tensor.device.type == "cpu" and ANCHORS.try_load()
+    return module.has_cuda() if tensor.is_cuda else tensor.is_cpu and module.try_load()
 
 
 def without_gaps(
@@ -29,3 +29,9 @@ def without_gaps(
         t if t is None or (inner is not None and t.stride()[1:] == inner) else t.contiguous()
         for t, inner in zip(tensors, strides, strict=True)
     )
+
+
+def room_for_gaussians(count: int, like: Tensor) -> tuple[Tensor, ...]:
+    """Return memory for means, opacities, scales, quaternions and colours, float32 on the device of `like`."""
+    shapes = (count, 3), (count,), (count, 3), (count, 4), (count, 3)
+    return tuple(like.new_empty(shape, dtype=torch.float32) for shape in shapes)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from sw_anchors import face
 from sw_anchors.native import ANCHORS
 
 
@@ -50,20 +51,60 @@ def steps_by_torch(
     return (steps if math.isinf(smallest) else steps.clamp(min=smallest)) * base, hidden, tangents
 
 
+def steps_by_kernel(
+    features: Tensor, parameters: Sequence[Tensor], base: Tensor, offset: float, smallest: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`steps_by_torch` of contiguous tensors that fit the kernel; not differentiable."""
+    first, first_bias, last, last_bias = parameters
+    steps, tangents = features.new_empty(len(features), 3), features.new_empty(len(features), 3)
+    hidden = features.new_empty(len(features), len(first))
+    face.predicted_steps(
+        features=features, first=first, first_bias=first_bias, last=last, last_bias=last_bias, base=base,
+        offset=offset, smallest=smallest, steps=steps, hidden=hidden, tangents=tangents,
+    )  # fmt: skip
+    return steps, hidden, tangents
+
+
+def slopes_by_kernel(
+    features: Tensor, parameters: Sequence[Tensor], base: Tensor, offset: float, smallest: float,
+    hidden: Tensor, tangents: Tensor, by_steps: Tensor, by_hidden: Tensor,
+) -> list[Tensor]:  # fmt: skip
+    """Gradients of features and parameters from those of what `steps_by_kernel` returned, all contiguous."""
+    first, first_bias, last, last_bias = parameters
+    found = [torch.empty_like(t) for t in (features, *parameters)]
+    to_features, to_first, to_first_bias, to_last, to_last_bias = found
+    face.predicted_steps_backward(
+        features=features, first=first, first_bias=first_bias, last=last, last_bias=last_bias, base=base,
+        offset=offset, smallest=smallest, hidden=hidden, tangents=tangents, by_steps=by_steps, by_hidden=by_hidden,
+        to_features=to_features, to_first=to_first, to_first_bias=to_first_bias, to_last=to_last,
+        to_last_bias=to_last_bias,
+    )  # fmt: skip
+    return found
+
+
 class _ByKernel(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, base: Tensor, offset: float, smallest: float, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         features, *parameters = (t.contiguous() for t in inputs)
         ctx.bounds = offset, smallest
-        steps, hidden, tangents = torch.ops.sw_anchors.predicted_steps(features, parameters, base, offset, smallest)
+        steps, hidden, tangents = steps_by_kernel(features, parameters, base, offset, smallest)
         ctx.save_for_backward(base, features, *parameters, hidden, tangents)
         return steps, hidden
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, to_steps: Tensor, to_hidden: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, by_steps: Tensor, by_hidden: Tensor) -> tuple[Tensor | None, ...]:
         base, features, *parameters, hidden, tangents = ctx.saved_tensors
-        found = torch.ops.sw_anchors.predicted_steps_backward(
-            features, parameters, base, *ctx.bounds, hidden, tangents, to_steps.contiguous(), to_hidden.contiguous()
+        offset, smallest = ctx.bounds
+        found = slopes_by_kernel(
+            features,
+            parameters,
+            base,
+            offset,
+            smallest,
+            hidden,
+            tangents,
+            by_steps.contiguous(),
+            by_hidden.contiguous(),
         )
         return None, None, None, *found

@@ -6,14 +6,16 @@ On the CPU networks and Gaussians are one kernel (`heads`); on CUDA, and where p
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from sw_anchors import face
 from sw_anchors.fast import heads
-from sw_anchors.fast.kernels import fit_kernels, without_gaps
+from sw_anchors.fast.kernels import fit_kernels, room_for_gaussians, without_gaps
 from sw_anchors.fast.networks import network_outputs
 from sw_anchors.neural_gaussians import Networks, NeuralGaussians
 
@@ -63,18 +65,48 @@ class _Gaussians(torch.autograd.Function):
         # Offsets and scales may be columns of a matrix: of these a row must be without gaps.
         given = without_gaps(inputs, (None, None, None, None, (3, 1), (1,), None))
         ctx.save_for_backward(*given, drawn)
-        return tuple(torch.ops.sw_anchors.spawn(*given, drawn))
+        if drawn.is_cuda:
+            return tuple(torch.ops.sw_anchors.spawn(*given, drawn))
+        means, opacities, sizes, quats, colors = found = room_for_gaussians(len(drawn), drawn)
+        face.spawn(**_named(given, drawn), means=means, opacities=opacities, sizes=sizes, quats=quats, colors=colors)
+        return found
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
         positions_learn, has_masks = ctx.needs_input_grad[4], ctx.saved_tensors[6] is not None
+        *given, drawn = ctx.saved_tensors
         contiguous = [slope.contiguous() for slope in slopes]
-        *found, to_masks, to_positions = torch.ops.sw_anchors.spawn_backward(
-            *ctx.saved_tensors, contiguous, positions_learn, torch.are_deterministic_algorithms_enabled()
-        )
+        if drawn.is_cuda:
+            *found, to_masks, to_positions = torch.ops.sw_anchors.spawn_backward(
+                *given, drawn, contiguous, positions_learn, torch.are_deterministic_algorithms_enabled()
+            )
+        else:
+            learning = [*given[:3], given[3] if positions_learn else None, *given[4:]]
+            zeros: list[Any] = [None if t is None else t.new_zeros(t.shape) for t in learning]
+            to_alpha, to_geometry, to_color, to_positions, to_offsets, to_scales, to_masks = zeros
+            means, opacities, sizes, quats, colors = contiguous
+            face.spawn_backward(
+                **_named(given, drawn),
+                by_means=means, by_opacities=opacities, by_sizes=sizes, by_quats=quats, by_colors=colors,
+                to_alpha=to_alpha, to_geometry=to_geometry, to_color=to_color, to_offsets=to_offsets,
+                to_scales=to_scales, to_masks=to_masks, to_positions=to_positions,
+            )  # fmt: skip
+            found = [to_alpha, to_geometry, to_color, to_offsets, to_scales]
         to_alpha, to_geometry, to_color, to_offsets, to_scales = found
         return (
             None, to_alpha, to_geometry, to_color, to_positions if positions_learn else None, to_offsets, to_scales,
             to_masks if has_masks else None,
         )  # fmt: skip
+
+
+def _named(given: Sequence[Tensor | None], drawn: Tensor) -> dict[str, Any]:
+    """Arguments of both operations of the CPU."""
+    alpha, geometry, color, positions, offsets, scales, masks = given
+    assert offsets is not None
+    assert scales is not None
+    return {
+        "alpha": alpha, "geometry": geometry, "color": color, "positions": positions, "offsets": offsets,
+        "scales": scales, "masks": masks, "drawn": drawn, "offset_row": offsets.stride(0),
+        "scale_row": scales.stride(0),
+    }  # fmt: skip

@@ -1,4 +1,4 @@
-// What the CPU and the CUDA binding share: the arguments of the ops, checked, and their memory.
+// The arguments of the ops that spawn Gaussians, checked, and their memory.
 #pragma once
 
 #include <ATen/core/Tensor.h>

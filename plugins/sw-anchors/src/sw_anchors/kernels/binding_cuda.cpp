@@ -41,6 +41,14 @@ std::vector<Tensor> spawn_backward(const Tensor& alpha, const Tensor& geometry, 
 
 }  // namespace
 
+TORCH_LIBRARY(sw_anchors, m) {
+  m.def("spawn(Tensor alpha, Tensor geometry, Tensor color, Tensor positions, Tensor offsets, Tensor scales,"
+        " Tensor? masks, Tensor drawn) -> Tensor[]");
+  // ordered: sums of an anchor's Gaussians have one order.
+  m.def("spawn_backward(Tensor alpha, Tensor geometry, Tensor color, Tensor positions, Tensor offsets, Tensor scales,"
+        " Tensor? masks, Tensor drawn, Tensor[] slopes, bool with_positions, bool ordered=False) -> Tensor[]");
+}
+
 TORCH_LIBRARY_IMPL(sw_anchors, CUDA, m) {
   m.impl("spawn", spawn);
   m.impl("spawn_backward", spawn_backward);

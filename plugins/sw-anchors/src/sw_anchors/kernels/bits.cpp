@@ -7,7 +7,7 @@
 #include <vector>
 
 #include "kernels.h"
-#include "vector_math.h"
+#include <splatwizard/vector_math.h>
 
 namespace SW_ARCH {
 

@@ -13,16 +13,12 @@
 //   predicted_steps  quantiser steps [count,3], the hidden layer and tanh of the outputs; backward: of `to_steps` and
 //                    `to_hidden`, sums the same for any number of threads
 //   sample_bits      bits of a sample of anchors by group, and their derivatives, row by row
-//   mixture_bits     the same from the outputs of networks, of features perhaps under two Gaussians
-//   channel_inputs   inputs [count, inputs] of the networks of channels; channel_slopes: from the derivatives of the bits
-//                    those of what follows, by x and outputs
 #pragma once
 
 #include <splatwizard/dispatch.h>
 #include <splatwizard/parallel.h>
 
 #include "heads.h"
-#include "mixture.h"
 #include "sample.h"
 #include "spawn.h"
 #include "steps.h"
@@ -57,12 +53,6 @@
                                 const sw_anchors::StepGradients& to, const splatwizard::Parallel& parallel);    \
   void sample_bits(const sw_anchors::Sample& from, const sw_anchors::SampleBits& to,                            \
                    const splatwizard::Parallel& parallel);                                                      \
-  void mixture_bits(const sw_anchors::Mixture& from, const sw_anchors::MixtureSlopes& to,                       \
-                    const splatwizard::Parallel& parallel);                                                     \
-  void channel_inputs(const sw_anchors::Channels& of, const float* x, const float* outputs, float* to,          \
-                      const splatwizard::Parallel& parallel);                                                   \
-  void channel_slopes(const sw_anchors::Channels& of, const sw_anchors::ChannelSlopes& by, float* to_x,         \
-                      float* to_outputs, const splatwizard::Parallel& parallel);                                \
   }
 SW_FOR_EACH_ARCH(SW_DECLARE_ANCHORS)
 #undef SW_DECLARE_ANCHORS

@@ -4,7 +4,7 @@
 #include <vector>
 
 #include "kernels.h"
-#include "vectors.h"
+#include <splatwizard/vectors.h>
 
 namespace SW_ARCH {
 

@@ -3,7 +3,7 @@
 #include <cmath>
 
 #include "kernels.h"
-#include "vectors.h"
+#include <splatwizard/vectors.h>
 
 namespace SW_ARCH {
 

@@ -17,6 +17,7 @@ from splatwizard_native import fast_enabled
 from sw_cat_3dgs.fast.plane_kernels import fit_kernels, sampled, sampled_backward
 from sw_cat_3dgs.principal_frame import UNIT
 from sw_cat_3dgs.triplane import GAIN, PAIRS, Triplane
+from sw_codecs.fast import kernel_operations
 from sw_codecs.native import CODECS
 
 MOST_SCALES = 8
@@ -108,7 +109,7 @@ class _Sampled(torch.autograd.Function):
         tables = [plane.movedim(1, 3).reshape(-1, plane.shape[1]) for plane in planes]  # [3 H W, C]
         if rounded:
             tables = [torch.round(table * GAIN).div_(GAIN) for table in tables]
-        found: Tensor = torch.ops.sw_codecs.sites_lookup(cells, weights, [table.contiguous() for table in tables])
+        found: Tensor = kernel_operations.sites_lookup(cells, weights, [table.contiguous() for table in tables])
         return found
 
     @staticmethod
@@ -118,7 +119,7 @@ class _Sampled(torch.autograd.Function):
         if ctx.on_gpu:
             return None, None, None, *sampled_backward(cells, weights, grad, ctx.planes)
         rows = [k * h * w for k, _, h, w in ctx.shapes]
-        tables = torch.ops.sw_codecs.sites_backward(cells, weights, grad.contiguous(), rows, ctx.shapes[0][1])
+        tables = kernel_operations.sites_backward(cells, weights, grad.contiguous(), rows, ctx.shapes[0][1])
         return None, None, None, *map(_as_plane, tables, ctx.shapes)
 
 

@@ -30,6 +30,7 @@ from sw_codecs.coders.model_spec import (
 )
 from sw_codecs.coders.symbol_stream import SymbolReader, SymbolWriter, check_again
 from sw_codecs.exact_native import has_exact
+from sw_codecs.fast import exact_operations
 
 CHUNK = 1 << 20
 HEADER = struct.Struct("<IiiII")
@@ -135,7 +136,7 @@ class RangeCoder(ChunkedCoder):
 def _decode_bits(payload: memoryview, count: int, share: float) -> np.ndarray:
     words = torch.from_numpy(np.frombuffer(payload, np.uint8).copy())
     zeros = int((1 - share) * ((1 << 24) - 2)) + 1  # docs/bitstream.md, tables of counts as models
-    bits, status = torch.ops.sw_codecs_exact.decode_bits(words, zeros, count)
+    bits, status = exact_operations.decode_bits(words, zeros, count)
     if status:
         raise BitstreamError("the coded words are damaged")
     found: np.ndarray = bits.numpy()

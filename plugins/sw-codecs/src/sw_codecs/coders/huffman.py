@@ -13,6 +13,7 @@ from splatwizard_native import NativeBuildError
 from sw_codecs.coders.arithmetic import ChunkedCoder
 from sw_codecs.coders.model_spec import Gaussian, Laplace, ModelSpec, Table, Tables
 from sw_codecs.coders.symbol_stream import guarded
+from sw_codecs.fast import kernel_operations
 from sw_codecs.native import CODECS
 
 MAX_TABLES = 4096  # distinct parameter pairs that may be turned into tables
@@ -38,7 +39,7 @@ class HuffmanCoder(ChunkedCoder):
         if 2 <= tables.shape[1] <= tables.size <= MAX_ENTRIES and np.isfinite(tables).all() and _has_kernel():
             # Copies: what torch wraps must be writable.
             copied = np.array(payload, np.uint8), np.array(tables, np.float32), np.array(index, np.int64)
-            decoded = torch.ops.sw_codecs.huffman_decode(*map(torch.from_numpy, copied))
+            decoded = kernel_operations.huffman_decode(*map(torch.from_numpy, copied))
             if len(decoded) < count:
                 raise BitstreamError(f"the codes end before {count:,} symbols: truncated data or a wrong model")
             return np.asarray(decoded.numpy() + np.int32(low), np.int32)

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from splatwizard_core.api import BitstreamError
 from sw_codecs.exact_native import EXACT
+from sw_codecs.fast import exact_operations
 
 FRACTION = 12
 ACTIVATION_LIMIT = 1 << 20  # 256 in units of 1
@@ -46,7 +47,7 @@ class IntegerMlp:
         if not self.weights:
             raise ValueError("a network needs at least one layer")
         self._leak = leak
-        self._layers: list[tuple[Tensor, Tensor]] = []
+        integers: list[np.ndarray] = []
         width = self.weights[0][0].shape[-1]
         for i, (w, b) in enumerate(self.weights):
             if w.ndim != 2 or b.shape != w.shape[:1] or w.shape[1] != width:
@@ -62,7 +63,11 @@ class IntegerMlp:
                 raise ValueError(f"layer {i}: a weight is not finite or exceeds {WEIGHT_LIMIT}")
             if (np.abs(wq).sum(1) * ACTIVATION_LIMIT + np.abs(bq)).max(initial=0) >= 2.0**53:
                 raise ValueError(f"layer {i}: sums could reach 2^53 and would not be exact")
-            self._layers.append((torch.from_numpy(wq).to(device), torch.from_numpy(bq).to(device)))
+            integers += [wq, bq]
+        self._flat = torch.from_numpy(np.concatenate([each.reshape(-1) for each in integers])).to(device)
+        parts = iter(self._flat.split([each.size for each in integers]))
+        self._layers = [(next(parts).view(w.shape), next(parts)) for w, _ in self.weights]
+        self.widths = torch.tensor([self.weights[0][0].shape[1], *(len(b) for _, b in self.weights)])  # and of inputs
 
     @classmethod
     def from_module(cls, module: nn.Module, *, output_scale: float | np.ndarray = 1.0) -> IntegerMlp:
@@ -114,20 +119,16 @@ class IntegerMlp:
         if rows is None and inputs.device.type == self._layers[0][0].device.type == "cpu" and EXACT.try_load():
             found = torch.empty(len(inputs), self.outputs, dtype=torch.int64) if out is None else out
             parts = parts if further is None else [p.to(torch.int64) for p in parts]
-            torch.ops.sw_codecs_exact.network([for_kernel(p) for p in parts], self.tensors(), self._leak, found)
+            exact_operations.network([for_kernel(p) for p in parts], self._flat, self.widths, self._leak, found)
             return found
         inputs = torch.cat(parts, dim=1)
         rows = rows or NUMBERS_AT_ONCE // max(max(w.shape) for w, _ in self._layers)
         found = torch.cat([self._evaluate(block) for block in inputs.split(max(rows, 1))])
         return found if out is None else out.copy_(found)
 
-    def tensors(self) -> list[Tensor]:
-        """Integers of weights [out, in] and biases [out] in turn, float64, layer by layer."""
-        return [each for layer in self._layers for each in layer]
-
     def flat(self) -> Tensor:
-        """Integers of all weights and biases, layer by layer, float64 [P]."""
-        return torch.cat([each.reshape(-1) for each in self.tensors()])
+        """Integers of all weights [out, in] and biases [out], layer by layer, float64 [P]."""
+        return self._flat
 
     def _evaluate(self, inputs: Tensor) -> Tensor:
         device = self._layers[0][0].device

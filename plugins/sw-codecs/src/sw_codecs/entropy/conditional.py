@@ -24,6 +24,7 @@ from sw_codecs.entropy.lattice import lattice
 from sw_codecs.entropy.rates import gaussian_bits
 from sw_codecs.entropy.rows import Numbers, RowContext, RowLattice
 from sw_codecs.exact_native import EXACT
+from sw_codecs.fast import exact_operations
 
 BLOCK_SYMBOLS = 1 << 20
 FLOAT_LATTICE = 16  # means and deviations in steps are rounded to 1/16
@@ -91,7 +92,7 @@ class ConditionalGaussian:
             except ValueError as error:
                 raise BitstreamError(str(error)) from error
             symbols = torch.from_numpy(self._exact.decode_at(data, *where))
-            found: Tensor = torch.ops.sw_codecs_exact.put_values(symbols, there, step.contiguous(), values)
+            found: Tensor = exact_operations.put_values(symbols, there, step.contiguous(), values)
             return found
         found = torch.from_numpy(self.decode(data, context, present))
         values.copy_(found * step)

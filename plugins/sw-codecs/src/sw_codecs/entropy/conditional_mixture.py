@@ -31,6 +31,7 @@ from sw_codecs.entropy.lattice import _tensor
 from sw_codecs.entropy.rates import gaussian_mass
 from sw_codecs.entropy.rows import Numbers, RowMixture
 from sw_codecs.exact_native import EXACT
+from sw_codecs.fast import exact_operations
 
 WIDTHS = np.array([4, 6, 8, 12, 16, 24, 32, 48, 64, 128, 256])
 """Half-widths of the windows that are coded without an escape."""
@@ -63,7 +64,7 @@ class _Rows:
         """Range-coded words of entries [n]: 0 .. 2 W, or the escape."""
         kernel = self._kernel()
         if kernel is not None:
-            words = torch.ops.sw_codecs_exact.encode_mixtures(*kernel, torch.from_numpy(entries.astype(np.int32)))
+            words = exact_operations.encode_mixtures(*kernel, torch.from_numpy(entries.astype(np.int32)))
             return bytes(words.numpy().tobytes())
         coder = constriction.stream.queue.RangeEncoder()
         with guarded(ValueError, "entropy coding"):
@@ -76,7 +77,7 @@ class _Rows:
         kernel = self._kernel()
         if kernel is not None:
             data = torch.from_numpy(np.frombuffer(words, np.uint8).copy())
-            entries, status = torch.ops.sw_codecs_exact.decode_mixtures(*kernel, data)
+            entries, status = exact_operations.decode_mixtures(*kernel, data)
             if status:
                 raise BitstreamError("coded words are damaged")
             return entries.numpy().astype(np.int64)
@@ -285,7 +286,7 @@ def _kernel_rows(parts: list[np.ndarray], shape: tuple[int, ...]) -> _Rows | Non
     if [each.shape for each in parts] != [shape] * 5 + [(shape[0], 1)]:
         return None
     tables = exact_tables()
-    *rows, status = torch.ops.sw_codecs_exact.mixture_rows(
+    *rows, status = exact_operations.mixture_rows(
         [_tensor(each) for each in parts], torch.from_numpy(tables.multipliers), torch.from_numpy(tables.thresholds),
         _summed_tables()[3], torch.from_numpy(WIDTHS),
     )  # fmt: skip

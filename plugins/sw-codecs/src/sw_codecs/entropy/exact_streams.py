@@ -27,6 +27,7 @@ from sw_codecs.bits.packing import ByteReader, write_varint
 from sw_codecs.coders.symbol_stream import check_again, guarded
 from sw_codecs.entropy.exact_tables import FRACTIONS, Family, exact_tables
 from sw_codecs.exact_native import EXACT
+from sw_codecs.fast import exact_operations
 
 VERSION = 2
 STREAM = 1 << 16
@@ -93,10 +94,8 @@ def encode(family: str, symbols: np.ndarray, centre: np.ndarray, number: np.ndar
             check_again(_decoded_in_turn(family, memoryview(content), rows, centre, number), symbols)
         return _framed(content, rows, symbols)
     at = _tensors(centre, number)
-    data, sizes = torch.ops.sw_codecs_exact.encode_streams(
-        share_tables(family), torch.from_numpy(symbols), at[0], at[1]
-    )
-    again, status = torch.ops.sw_codecs_exact.decode_streams(share_tables(family), data, sizes, *at)
+    data, sizes = exact_operations.encode_streams(share_tables(family), torch.from_numpy(symbols), at[0], at[1])
+    again, status = exact_operations.decode_streams(share_tables(family), data, sizes, *at)
     check_again(None if status else again.numpy(), symbols)
     return _framed(data.numpy().tobytes(), sizes.numpy(), symbols)
 
@@ -113,9 +112,7 @@ def decode(family: str, data: bytes | memoryview, centre: np.ndarray, number: np
     if EXACT.try_load():
         payload = torch.from_numpy(np.frombuffer(content, np.uint8).copy())
         at = _tensors(centre, number)
-        symbols, status = torch.ops.sw_codecs_exact.decode_streams(
-            share_tables(family), payload, torch.from_numpy(sizes), *at
-        )
+        symbols, status = exact_operations.decode_streams(share_tables(family), payload, torch.from_numpy(sizes), *at)
         refuse_damage(status)
         found: np.ndarray = symbols.numpy()
     else:

@@ -15,6 +15,7 @@ from torch import Tensor
 from sw_codecs.entropy.exact_streams import SYMBOL_LIMIT
 from sw_codecs.entropy.exact_tables import FRACTIONS, exact_tables
 from sw_codecs.exact_native import EXACT
+from sw_codecs.fast import exact_operations
 
 UNIT = 4096  # 12 fractional bits
 PARAMETER_LIMIT = 1 << 48  # shifts and products below stay within 63 bits
@@ -38,7 +39,7 @@ def lattice(
     full = arrays[0].shape
     fits = len(full) == 2 and [each.shape for each in arrays[1:]] == [full, (full[0], 1)]
     if fits and arrays[0].size and EXACT.try_load():
-        centre, number, status = torch.ops.sw_codecs_exact.lattice(
+        centre, number, status = exact_operations.lattice(
             *map(_tensor, arrays),
             None if there is None else torch.from_numpy(there),
             torch.from_numpy(exact_tables().thresholds),

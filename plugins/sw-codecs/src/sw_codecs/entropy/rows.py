@@ -12,6 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sw_codecs.fast import exact_operations
+
 Numbers = np.ndarray | Tensor
 
 
@@ -46,7 +48,7 @@ class RowLattice:
         if present is None:
             return self.centre.reshape(-1).numpy(), self.number.reshape(-1).numpy()
         there = torch.from_numpy(np.ascontiguousarray(present, bool))
-        centre, number = torch.ops.sw_codecs_exact.present_rows(self.centre, self.number, there)
+        centre, number = exact_operations.present_rows(self.centre, self.number, there)
         return centre.numpy(), number.numpy()
 
 

@@ -1,32 +1,18 @@
-// What the CPU and the CUDA binding share: the arguments of the ops, checked.
+// The arguments of the ops on grids, checked.
 #pragma once
 
 #include <ATen/core/Tensor.h>
 
-#include "grid.h"
+#include "levels.h"
 
 namespace sw_grid {
 
-// Levels of a grid over `axes` axes; every entry they have is below `entries`.
 inline Levels levels_of(at::ArrayRef<double> scales, at::IntArrayRef lasts, at::IntArrayRef starts,
                         at::IntArrayRef dense, int64_t log2_size, int64_t axes, int64_t entries) {
   const size_t count = scales.size();
-  TORCH_CHECK(count > 0 && count <= size_t(kMaxLevels) && lasts.size() == count && starts.size() == count &&
-                  dense.size() == count && log2_size >= 0 && log2_size <= 30 && (axes == 2 || axes == 3),
-              "sw_codecs: malformed levels");
-  Levels levels{};
-  levels.count = int(count), levels.mask = (uint32_t(1) << log2_size) - 1;
-  for (size_t i = 0; i < count; ++i) {
-    TORCH_CHECK(lasts[i] >= 1 && lasts[i] < 1 << 16 && scales[i] > 0 && scales[i] <= double(lasts[i] + 1) &&
-                    starts[i] >= 0,
-                "sw_codecs: level ", i, " is out of range");
-    int64_t size = dense[i] ? 1 : int64_t(levels.mask) + 1;
-    for (int64_t axis = 0; dense[i] && axis < axes; ++axis) size *= lasts[i] + 1;
-    TORCH_CHECK(starts[i] + size <= entries && entries < int64_t(1) << 31, "sw_codecs: level ", i,
-                " ends at entry ", starts[i] + size, " of ", entries);
-    levels.of[i] = {float(scales[i]), int32_t(lasts[i]), int32_t(starts[i]), int32_t(dense[i] != 0)};
-  }
-  return levels;
+  TORCH_CHECK(lasts.size() == count && starts.size() == count && dense.size() == count, "sw_codecs: malformed levels");
+  return levels_of(int64_t(count), scales.data(), lasts.data(), starts.data(), dense.data(), log2_size, axes, entries,
+                   [](const std::string& text) { TORCH_CHECK(false, "sw_codecs: ", text); });
 }
 
 inline void check(const at::Tensor& t, const char* name, const at::Tensor& like, at::IntArrayRef shape) {

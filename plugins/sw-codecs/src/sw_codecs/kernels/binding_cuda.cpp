@@ -1,4 +1,4 @@
-// The kernels on CUDA as torch ops, on the current stream. Compiled only where there is CUDA.
+// Grids on CUDA as torch ops, on the current stream. Compiled only where there is CUDA.
 #ifdef SW_WITH_CUDA
 
 #include <ATen/core/Tensor.h>
@@ -105,6 +105,19 @@ void signs_backward(const at::Tensor& x, at::IntArrayRef axes, at::Tensor table,
 }
 
 }  // namespace
+
+TORCH_LIBRARY(sw_codecs, m) {
+  m.def("lookup(Tensor x, Tensor values, float[] scales, int[] lasts, int[] starts, int[] dense, int log2_size)"
+        " -> Tensor");
+  // With `largest`, which no number of the gradient exceeds, sums are the same in any order.
+  m.def("backward(Tensor x, Tensor gradient, int entries, int features, float[] scales, int[] lasts, int[] starts,"
+        " int[] dense, int log2_size, Tensor? largest=None) -> Tensor");
+  // Features of grids of signs into columns of `found`, and their gradients added to `table`.
+  m.def("signs_lookup(Tensor x, int[] axes, Tensor table, Tensor(a!) found, int first, float[] scales, int[] lasts,"
+        " int[] starts, int[] dense, int log2_size) -> ()");
+  m.def("signs_backward(Tensor x, int[] axes, Tensor(a!) table, Tensor gradient, int first, float[] scales,"
+        " int[] lasts, int[] starts, int[] dense, int log2_size, Tensor? largest=None) -> ()");
+}
 
 TORCH_LIBRARY_IMPL(sw_codecs, CUDA, m) {
   m.impl("lookup", lookup);

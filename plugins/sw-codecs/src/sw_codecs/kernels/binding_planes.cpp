@@ -1,18 +1,4 @@
 // Learned planes in training as torch ops, on the current stream: their bits, and the lookup in triplanes. On CUDA alone.
-#include <torch/library.h>
-
-TORCH_LIBRARY_FRAGMENT(sw_codecs, m) {
-  // Planes [K,C,H,W] of each scale and parameters [K,1058] -> [K,1060]: the gradients of the bits by the parameters, the
-  // bits, 0; and the gradients by the planes, or none.
-  // ordered: the sums of the latter have one order, in more memory; those of the former always have.
-  m.def("plane_bits(Tensor[] planes, Tensor parameters, bool planes_learn, bool ordered=False) -> (Tensor, Tensor[])");
-  // Features [n, scales 3 C] of planes [3,C,H,W], rounded to multiples of 1/gain where it is not 0.
-  m.def("triplane_lookup(Tensor cells, Tensor weights, Tensor[] planes, float gain) -> Tensor");
-  // With `largest`, which no slope exceeds, sums are the same in any order.
-  m.def("triplane_backward(Tensor cells, Tensor weights, Tensor slopes, Tensor[] planes,"
-        " Tensor? largest=None) -> Tensor[]");
-}
-
 #ifdef SW_WITH_CUDA
 
 #include <ATen/core/Tensor.h>
@@ -21,6 +7,7 @@ TORCH_LIBRARY_FRAGMENT(sw_codecs, m) {
 #include <c10/cuda/CUDAException.h>
 #include <c10/cuda/CUDAGuard.h>
 #include <c10/cuda/CUDAStream.h>
+#include <torch/library.h>
 
 #include <limits>
 #include <optional>
@@ -166,6 +153,18 @@ std::vector<Tensor> triplane_backward(const Tensor& cells, const Tensor& weights
 }
 
 }  // namespace
+
+TORCH_LIBRARY_FRAGMENT(sw_codecs, m) {
+  // Planes [K,C,H,W] of each scale and parameters [K,1058] -> [K,1060]: the gradients of the bits by the parameters, the
+  // bits, 0; and the gradients by the planes, or none.
+  // ordered: the sums of the latter have one order, in more memory; those of the former always have.
+  m.def("plane_bits(Tensor[] planes, Tensor parameters, bool planes_learn, bool ordered=False) -> (Tensor, Tensor[])");
+  // Features [n, scales 3 C] of planes [3,C,H,W], rounded to multiples of 1/gain where it is not 0.
+  m.def("triplane_lookup(Tensor cells, Tensor weights, Tensor[] planes, float gain) -> Tensor");
+  // With `largest`, which no slope exceeds, sums are the same in any order.
+  m.def("triplane_backward(Tensor cells, Tensor weights, Tensor slopes, Tensor[] planes,"
+        " Tensor? largest=None) -> Tensor[]");
+}
 
 TORCH_LIBRARY_IMPL(sw_codecs, CUDA, m) {
   m.impl("plane_bits", plane_bits);

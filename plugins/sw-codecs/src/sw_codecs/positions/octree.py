@@ -25,6 +25,7 @@ from sw_codecs.coders.count_tables import code_counts, count_codes, pack_tables,
 from sw_codecs.coders.model_spec import Tables
 from sw_codecs.coders.symbol_stream import SymbolReader, SymbolWriter
 from sw_codecs.exact_native import has_exact
+from sw_codecs.fast import exact_operations
 from sw_codecs.positions import morton
 from sw_codecs.positions.duplicates import decode_duplicates, encode_duplicates, without_duplicates
 from sw_codecs.positions.ordering import spatial_order
@@ -145,9 +146,7 @@ def _decode_levels(words: memoryview, tables: np.ndarray, crc: int, limit: int) 
     """Nodes int64 below the last level; `tables` [levels, 4, 255] counts, `limit` the most nodes of a level."""
     if len(words) % 4 == 0 and has_exact():
         coded = torch.from_numpy(np.frombuffer(words, np.uint8).copy())
-        nodes, occupancies, sizes, status = torch.ops.sw_codecs_exact.decode_octree(
-            coded, torch.from_numpy(tables), limit
-        )
+        nodes, occupancies, sizes, status = exact_operations.decode_octree(coded, torch.from_numpy(tables), limit)
         if status == BEYOND_LIMIT:
             _refuse_nodes(int((sizes > 0).sum()) - 1, limit)
         counts = sizes.tolist()

@@ -161,6 +161,20 @@ std::tuple<at::Tensor, at::Tensor> disagreement_backward(const at::Tensor& grad,
 
 }  // namespace
 
+TORCH_LIBRARY(splatwizard_gaussians, m) {
+  // Of no elements in row_steps: no bias correction. Returns the places of those that the kernel cannot take, which are
+  // left as they were.
+  m.def("sparse_adam_many(Tensor(a!)[] params, Tensor[] grads, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs,"
+        " Tensor(d!)[] row_steps, Tensor mask, float[] lrs, float[] beta1s, float[] beta2s, float[] epss) -> int[]");
+  m.def("view_statistics(Tensor gradients, Tensor radii, Tensor(a!) grad_accum, Tensor(b!) denom,"
+        " Tensor(c!) max_radii) -> ()");
+  m.def("fragment_statistics(Tensor gradients, Tensor logits, Tensor fragments, Tensor(a!) sums, float least_clear)"
+        " -> bool");
+  m.def("disagreement(Tensor depth, Tensor normals, Tensor alpha, float[] focal_and_center) -> Tensor");
+  m.def("disagreement_backward(Tensor grad, Tensor depth, Tensor normals, Tensor alpha, float[] focal_and_center)"
+        " -> (Tensor, Tensor)");
+}
+
 TORCH_LIBRARY_IMPL(splatwizard_gaussians, CUDA, m) {
   m.impl("sparse_adam_many", sparse_adam_many);
   m.impl("view_statistics", view_statistics);

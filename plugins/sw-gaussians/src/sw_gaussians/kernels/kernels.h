@@ -13,10 +13,9 @@ struct SparseAdamArgs {
   const float* grad;
   float* exp_avg;
   float* exp_avg_sq;
-  const bool* mask;     // [rows] which rows are updated
-  int32_t* row_steps;   // [rows] updates of each row so far, counted up; null: no bias correction
+  const bool* mask;  // [rows] which rows are updated
   int64_t rows, width;
-  double lr, log_beta1, log_beta2;
+  float lr;
   float one_minus_beta1;
   float beta2;
   float one_minus_beta2;

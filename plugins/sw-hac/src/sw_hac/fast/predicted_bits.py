@@ -11,11 +11,14 @@ from enum import IntEnum
 from typing import Any, Protocol
 
 import torch
-from sw_anchors.fast import sample_bits
+from sw_anchors.fast.kernels import fit_kernels
 from sw_anchors.fast.sample_bits import summed_bits
 from sw_anchors.rate_model import SMALLEST_SCALE, AnchorForecast, Floors
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+
+from sw_hac import face
+from sw_hac.native import HAC
 
 
 class Networks(Protocol):
@@ -98,7 +101,12 @@ class Model(Protocol):
 
 def fits(values: Tensor, forecast: AnchorForecast, masks: Tensor, counted: Tensor) -> bool:
     """Whether there are kernels for such tensors, all float32 of one device; loads them."""
-    return sample_bits.fits(values, forecast.outputs, forecast.sample_steps, masks, counted)
+    return have_kernels(values, forecast.outputs, forecast.sample_steps, masks, counted)
+
+
+def have_kernels(*tensors: Tensor) -> bool:
+    """Whether there are kernels for such tensors, all float32 of one device; loads them."""
+    return len({t.device for t in tensors}) == 1 and fit_kernels(*tensors, module=HAC)
 
 
 def rate(
@@ -166,10 +174,11 @@ class _MixtureBits(torch.autograd.Function):
         kept: list[Tensor] = []
         if networks is not None:
             columns, packed = networks.columns, networks.packed(parameters)
-            inputs = torch.ops.sw_anchors.channel_inputs(x, outputs, *ctx.read)
+            inputs = _channel_inputs(x, outputs, *ctx.read)
             hidden, second = networks.forward(packed, inputs)
             kept = [packed, inputs, hidden]
-        bits, *slopes = torch.ops.sw_anchors.mixture_bits(
+        form = torch.ops.sw_hac.mixture_bits if x.is_cuda else _bits_on_cpu
+        bits, *slopes = form(
             x, outputs, p.units, second, columns, steps, masks, counted,
             p.base, p.smallest, p.smallest_scale, p.scale_floor, int(p.masks),
         )  # fmt: skip
@@ -187,6 +196,50 @@ class _MixtureBits(torch.autograd.Function):
             by_second, packed, inputs, hidden = rest
             to_inputs, to_packed = networks.backward(packed, inputs, hidden, by_second)
             to_parameters = networks.unpacked(to_packed, slope)
-        to_x, to_outputs = torch.ops.sw_anchors.channel_slopes(slope, by_x, by_outputs, to_inputs, *ctx.read)
+        to_x, to_outputs = _channel_slopes(slope, by_x, by_outputs, to_inputs, *ctx.read)
         to_steps, to_masks = torch._foreach_mul([by_steps, by_masks], slope)
         return to_x, to_outputs, to_steps, to_masks, None, None, None, *to_parameters
+
+
+def _bits_on_cpu(
+    x: Tensor, outputs: Tensor, units: Tensor, second: Tensor | None, columns: Tensor | None, steps: Tensor,
+    masks: Tensor, counted: Tensor, base: float, smallest: float, smallest_scale: float, scale_floor: float, kind: int,
+) -> list[Tensor]:  # fmt: skip
+    """Bits [S,3]; derivatives of their sum by x, outputs, steps, masks and, if there is one, second."""
+    learning = [x, outputs, steps, masks, *([] if second is None else [second])]
+    bits, *slopes = found = [torch.empty_like(t) for t in (steps, *learning)]
+    to_x, to_outputs, to_steps, to_masks, *to_second = slopes
+    face.mixture_bits(
+        x=x, outputs=outputs, units=units, columns=columns, second=second, steps=steps, masks=masks, counted=counted,
+        base=base, smallest=smallest, smallest_scale=smallest_scale, scale_floor=scale_floor, kind=kind, bits=bits,
+        to_x=to_x, to_outputs=to_outputs, to_steps=to_steps, to_masks=to_masks, to_second=next(iter(to_second), None),
+    )  # fmt: skip
+    return found
+
+
+def _channel_inputs(x: Tensor, outputs: Tensor, units: Tensor, features: int, base: float, context: bool) -> Tensor:
+    """Inputs of the networks of channels: features, perhaps context, then a column of ones and zeros."""
+    if x.is_cuda:
+        found: Tensor = torch.ops.sw_hac.channel_inputs(x, outputs, units, features, base, context)
+        return found
+    inputs = x.new_empty(len(x), features * (4 if context else 1) // 4 * 4 + 4)
+    face.channel_inputs(x=x, outputs=outputs, units=units, features=features, base=base, context=context, inputs=inputs)
+    return inputs
+
+
+def _channel_slopes(
+    slope: Tensor, by_x: Tensor, by_outputs: Tensor, by_inputs: Tensor | None, units: Tensor, features: int,
+    base: float, context: bool,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Gradients by x and outputs, from the derivatives of the bits and the one of these by what follows."""
+    if by_x.is_cuda:
+        found: list[Tensor] = torch.ops.sw_hac.channel_slopes(
+            slope, by_x, by_outputs, by_inputs, units, features, base, context
+        )
+        return found[0], found[1]
+    to_x, to_outputs = torch.empty_like(by_x), torch.empty_like(by_outputs)
+    face.channel_slopes(
+        slope=float(slope), by_x=by_x, by_outputs=by_outputs, by_inputs=by_inputs, units=units, features=features,
+        base=base, context=context, to_x=to_x, to_outputs=to_outputs,
+    )  # fmt: skip
+    return to_x, to_outputs

@@ -10,9 +10,11 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from splatwizard_native import fast_enabled
-from sw_codecs.context.fast.grid_lookup import MAX_FEATURES, MAX_LEVELS, Levels, levels_of
+from sw_codecs.context.fast.grid_lookup import MAX_FEATURES, levels_of
 from sw_codecs.context.fast.ordered_sums import largest_for_sums
 from sw_codecs.context.hash_grid import HashGrid
+from sw_codecs.fast import kernel_operations
+from sw_codecs.fast.kernel_operations import MAX_LEVELS, Levels
 from sw_codecs.native import CODECS
 
 Parts = Sequence[tuple[tuple[int, ...], HashGrid]]
@@ -85,7 +87,7 @@ def look_up_signs(x: Tensor, grids: Sequence[tuple[tuple[int, ...], Levels]], ta
     found = x.new_empty(len(x), features * sum(len(levels[0]) for _, levels in grids))
     first = 0
     for (axes, levels), table in zip(grids, tables, strict=True):
-        torch.ops.sw_codecs.signs_lookup(x, axes, table, found, first, *levels)
+        kernel_operations.signs_lookup(x, axes, table, found, first, *levels)
         first += features * len(levels[0])
     return found
 
@@ -100,5 +102,5 @@ def add_sign_gradients(
     first, to_features = 0, to_features.contiguous()
     largest = largest_for_sums(to_features)
     for (axes, levels), table in zip(grids, tables, strict=True):
-        torch.ops.sw_codecs.signs_backward(x, axes, table, to_features, first, *levels, largest)
+        kernel_operations.signs_backward(x, axes, table, to_features, first, *levels, largest=largest)
         first += table.shape[1] * len(levels[0])

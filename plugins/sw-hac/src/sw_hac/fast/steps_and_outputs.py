@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 from sw_anchors.fast.kernels import fit_kernels
-from sw_anchors.fast.predicted_steps import steps_by_torch, steps_fit_kernel
+from sw_anchors.fast.predicted_steps import slopes_by_kernel, steps_by_kernel, steps_by_torch, steps_fit_kernel
 from sw_anchors.fast.rows import add_rows, gathered
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
@@ -53,7 +53,7 @@ class _StepsAndOutputs(torch.autograd.Function):
             t.contiguous() for t in (features, first, first_bias, last[part], last_bias[part], base)
         )
         by_kernel = steps_fit_kernel(features, *parameters, base)
-        form = torch.ops.sw_anchors.predicted_steps if by_kernel else steps_by_torch
+        form = steps_by_kernel if by_kernel else steps_by_torch
         steps, hidden, tangents = form(features, parameters, base, OFFSET, SMALLEST_STEP)
         rows = None if isinstance(sample, slice) else sample
         own, of_sample = (hidden[sample], steps[sample].clone()) if rows is None else gathered(rows, (hidden, steps))
@@ -76,7 +76,7 @@ class _StepsAndOutputs(torch.autograd.Function):
             to_hidden = torch.zeros_like(hidden)
             to_hidden[ctx.sample if rows is None else rows] = to_wide
             parameters = [t.contiguous() for t in (first, first_bias, last[part], last_bias[part])]
-            to_features, to_first, to_first_bias, *of_steps = torch.ops.sw_anchors.predicted_steps_backward(
+            to_features, to_first, to_first_bias, *of_steps = slopes_by_kernel(
                 features, parameters, base, OFFSET, SMALLEST_STEP, hidden, tangents, to_steps.contiguous(), to_hidden
             )
             to_last[part] += of_steps[0]

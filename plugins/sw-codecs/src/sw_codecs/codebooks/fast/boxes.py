@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from splatwizard_native import fast_enabled
+from sw_codecs.fast import kernel_operations
 from sw_codecs.native import CODECS
 
 WORTH_BOXES = 1 << 22
@@ -43,8 +44,7 @@ def search_by_boxes(x: Tensor, entries: Tensor) -> Callable[[Tensor, int], Tenso
     turned = (centred @ axes).contiguous()
 
     def look(rows: Tensor) -> tuple[Tensor, float]:
-        found: tuple[Tensor, float] = torch.ops.sw_codecs.nearest_entries((rows - centre) @ axes, turned)
-        return found
+        return kernel_operations.nearest_entries((rows - centre) @ axes, turned)
 
     if look(x[:: max(len(x) // SAMPLE, 1)])[1] > SHARE:
         return None

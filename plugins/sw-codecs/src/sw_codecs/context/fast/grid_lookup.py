@@ -15,11 +15,12 @@ from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from splatwizard_native import fast_enabled
 from sw_codecs.context.fast.ordered_sums import largest_for_sums
+from sw_codecs.fast import kernel_operations
+from sw_codecs.fast.kernel_operations import MAX_LEVELS, Levels
 from sw_codecs.native import CODECS
 
-MAX_LEVELS = 32
 MAX_FEATURES = 8
-"""`kMaxLevels` and `kMaxFeatures` of kernels/grid.h."""
+"""`kMaxFeatures` of kernels/grid.h."""
 
 
 class Grid(Protocol):
@@ -33,10 +34,6 @@ class Grid(Protocol):
     def levels(self) -> Sequence[Any]:
         """Its levels."""
         ...
-
-
-Levels = tuple[list[float], list[int], list[int], list[int], int]
-"""Levels of a grid as the ops take them: scales, last vertices, first entries, whether dense; log2_size."""
 
 
 def fits(grid: Grid, x: Tensor, values: Tensor) -> bool:
@@ -86,15 +83,15 @@ class _Lookup(torch.autograd.Function):
     def forward(ctx: Any, values: Tensor, x: Tensor, grid: Grid) -> Tensor:
         ctx.save_for_backward(x)
         ctx.shape, ctx.levels = values.shape, levels_of(grid)
-        found: Tensor = torch.ops.sw_codecs.lookup(x, values.contiguous(), *ctx.levels)
+        found: Tensor = kernel_operations.lookup(x, values.contiguous(), *ctx.levels)
         return found
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
         (x,) = ctx.saved_tensors
-        found = torch.ops.sw_codecs.backward(
-            x, gradient.contiguous(), *ctx.shape, *ctx.levels, largest_for_sums(gradient)
+        found = kernel_operations.backward(
+            x, gradient.contiguous(), *ctx.shape, *ctx.levels, largest=largest_for_sums(gradient)
         )
         return found, None, None
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from splatwizard_native import fast_enabled
 from sw_codecs.exact_native import EXACT
+from sw_codecs.fast import exact_operations
 
 MAX_FEATURES = 16
 """Signs of an entry, one bit each."""
@@ -26,7 +27,7 @@ def integer_features(grids: Sequence[tuple[Sequence[int], Any]], codes: Tensor, 
     codes, column = codes.to(torch.int64).contiguous(), 0
     found = codes.new_empty(len(codes), sum(grid.width for _, grid in grids), dtype=dtype)
     for axes, grid in grids:
-        torch.ops.sw_codecs_exact.grid_features(
+        exact_operations.grid_features(
             codes, list(axes), _packed_signs(grid), grid.features, grid.integer_levels(column), grid.dense_levels,
             grid.log2_size, found,
         )  # fmt: skip

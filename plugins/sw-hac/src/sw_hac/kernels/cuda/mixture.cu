@@ -2,7 +2,7 @@
 // the way back: a warp takes a row.
 #include "mixture.h"
 
-namespace sw_anchors::cuda {
+namespace sw_hac::cuda {
 namespace {
 
 constexpr int kWarp = 32, kRows = 8, kGroups = 3;
@@ -150,4 +150,4 @@ void channel_slopes(const Channels& of, const ChannelSlopes& by, float* to_x, fl
   if (of.count > 0) slopes_kernel<<<blocks_of(of.count), threads(), 0, stream>>>(of, by, to_x, to_outputs);
 }
 
-}  // namespace sw_anchors::cuda
+}  // namespace sw_hac::cuda

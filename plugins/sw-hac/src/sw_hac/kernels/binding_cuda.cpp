@@ -1,49 +1,28 @@
-// Bits of a sample of anchors under predicted distributions, and inputs of the networks of channels, as torch ops: on
-// the CPU, and on CUDA on the current stream.
+// Bits of a sample of anchors under predicted distributions, and inputs of the networks of channels, as torch ops on
+// CUDA, on the current stream. Compiled only where there is CUDA.
+#ifdef SW_WITH_CUDA
+
 #include <ATen/core/Tensor.h>
 #include <ATen/ops/empty.h>
+#include <c10/cuda/CUDAException.h>
+#include <c10/cuda/CUDAGuard.h>
+#include <c10/cuda/CUDAStream.h>
 #include <torch/library.h>
-
-#include <splatwizard/torch_parallel.h>
 
 #include <optional>
 #include <vector>
 
-#include "kernels.h"
-
-#ifdef SW_WITH_CUDA
-#include <c10/cuda/CUDAException.h>
-#include <c10/cuda/CUDAGuard.h>
-#include <c10/cuda/CUDAStream.h>
-
 #include "cuda/mixture.h"
-#endif
 
 namespace {
 
-using namespace sw_anchors;
+using namespace sw_hac;
 using at::Tensor;
-
-// Calls the kernel of the CPU, or that of CUDA on the device of `like`.
-#ifdef SW_WITH_CUDA
-#define SW_CALL(like, function, ...)                                                            \
-  do {                                                                                          \
-    if ((like).is_cuda()) {                                                                     \
-      const c10::cuda::CUDAGuard guard((like).device());                                        \
-      sw_anchors::cuda::function(__VA_ARGS__, c10::cuda::getCurrentCUDAStream());               \
-      C10_CUDA_KERNEL_LAUNCH_CHECK();                                                           \
-    } else {                                                                                    \
-      SW_SELECT(function)(__VA_ARGS__, splatwizard::torch_parallel());                          \
-    }                                                                                           \
-  } while (false)
-#else
-#define SW_CALL(like, function, ...) SW_SELECT(function)(__VA_ARGS__, splatwizard::torch_parallel())
-#endif
 
 void check(const Tensor& t, const char* name, const Tensor& like, at::IntArrayRef shape,
            at::ScalarType type = at::kFloat) {
   TORCH_CHECK(t.scalar_type() == type && t.is_contiguous() && t.device() == like.device() && t.sizes() == shape,
-              "sw_anchors: ", name, " must be contiguous ", type, " ", shape, " on ", like.device(), ", got ",
+              "sw_hac: ", name, " must be contiguous ", type, " ", shape, " on ", like.device(), ", got ",
               t.toString(), " ", t.sizes(), " on ", t.device());
 }
 
@@ -62,13 +41,13 @@ std::vector<Tensor> mixture_bits(const Tensor& x, const Tensor& outputs, const T
                                  const std::optional<Tensor>& second, const std::optional<Tensor>& columns,
                                  const Tensor& steps, const Tensor& masks, const Tensor& counted, double base,
                                  double smallest, double smallest_scale, double scale_floor, int64_t kind) {
-  TORCH_CHECK(x.dim() == 2 && masks.dim() == 2 && outputs.dim() == 2,
-              "sw_anchors: x must be [s,numbers], masks [s,k], outputs [s,width]");
-  TORCH_CHECK(second.has_value() == columns.has_value(), "sw_anchors: a second Gaussian needs its columns");
-  TORCH_CHECK(kAlone <= kind && kind <= kGatedMean, "sw_anchors: there is no kind ", kind, " of masks");
+  TORCH_CHECK(x.is_cuda() && x.dim() == 2 && masks.dim() == 2 && outputs.dim() == 2,
+              "sw_hac: x must be [s,numbers], masks [s,k], outputs [s,width]");
+  TORCH_CHECK(second.has_value() == columns.has_value(), "sw_hac: a second Gaussian needs its columns");
+  TORCH_CHECK(kAlone <= kind && kind <= kGatedMean, "sw_hac: there is no kind ", kind, " of masks");
   const int64_t s = x.size(0), k = masks.size(1), numbers = x.size(1), f = numbers - 6 - 3 * k, width = outputs.size(1);
-  TORCH_CHECK(f >= 0, "sw_anchors: ", numbers, " numbers are too few for ", k, " offsets");
-  TORCH_CHECK(width >= 2 * numbers + (second.has_value() ? f : 0), "sw_anchors: ", width, " outputs are too few for ",
+  TORCH_CHECK(f >= 0, "sw_hac: ", numbers, " numbers are too few for ", k, " offsets");
+  TORCH_CHECK(width >= 2 * numbers + (second.has_value() ? f : 0), "sw_hac: ", width, " outputs are too few for ",
               numbers, " numbers");
   Mixture from{};
   from.count = s, from.features = int(f), from.offsets = int(k), from.width = int(width);
@@ -90,15 +69,17 @@ std::vector<Tensor> mixture_bits(const Tensor& x, const Tensor& outputs, const T
     from.columns = columns->const_data_ptr<int>();
     to.second = room(found, x, {s, 3 * f});
   }
-  SW_CALL(x, mixture_bits, from, to);
+  const c10::cuda::CUDAGuard guard(x.device());
+  cuda::mixture_bits(from, to, c10::cuda::getCurrentCUDAStream());
+  C10_CUDA_KERNEL_LAUNCH_CHECK();
   return found;
 }
 
 Channels channels_of(const Tensor& x, const Tensor& outputs, const Tensor& units, int64_t features, double base,
                      bool context) {
-  TORCH_CHECK(x.dim() == 2 && outputs.dim() == 2, "sw_anchors: x must be [s,numbers], outputs [s,width]");
+  TORCH_CHECK(x.dim() == 2 && outputs.dim() == 2, "sw_hac: x must be [s,numbers], outputs [s,width]");
   const int64_t numbers = x.size(1), width = outputs.size(1), taken = features * (context ? 4 : 1);
-  TORCH_CHECK(0 < features && features <= numbers && 3 * features <= width, "sw_anchors: ", features,
+  TORCH_CHECK(0 < features && features <= numbers && 3 * features <= width, "sw_hac: ", features,
               " features do not fit ", numbers, " numbers and ", width, " outputs");
   Channels of{};
   of.count = x.size(0), of.features = int(features), of.numbers = int(numbers), of.width = int(width);
@@ -115,7 +96,9 @@ Tensor channel_inputs(const Tensor& x, const Tensor& outputs, const Tensor& unit
   const float* const from_outputs = floats(outputs, "outputs", x, {of.count, of.width});
   std::vector<Tensor> found;
   float* const to = room(found, x, {of.count, of.inputs});
-  SW_CALL(x, channel_inputs, of, from_x, from_outputs, to);
+  const c10::cuda::CUDAGuard guard(x.device());
+  cuda::channel_inputs(of, from_x, from_outputs, to, c10::cuda::getCurrentCUDAStream());
+  C10_CUDA_KERNEL_LAUNCH_CHECK();
   return found[0];
 }
 
@@ -131,13 +114,15 @@ std::vector<Tensor> channel_slopes(const Tensor& slope, const Tensor& by_x, cons
   std::vector<Tensor> found;
   float* const to_x = room(found, by_x, {of.count, of.numbers});
   float* const to_outputs = room(found, by_x, {of.count, of.width});
-  SW_CALL(by_x, channel_slopes, of, by, to_x, to_outputs);
+  const c10::cuda::CUDAGuard guard(by_x.device());
+  cuda::channel_slopes(of, by, to_x, to_outputs, c10::cuda::getCurrentCUDAStream());
+  C10_CUDA_KERNEL_LAUNCH_CHECK();
   return found;
 }
 
 }  // namespace
 
-TORCH_LIBRARY_FRAGMENT(sw_anchors, m) {
+TORCH_LIBRARY(sw_hac, m) {
   m.def("mixture_bits(Tensor x, Tensor outputs, Tensor units, Tensor? second, Tensor? columns, Tensor steps,"
         " Tensor masks, Tensor counted, float base, float smallest, float smallest_scale, float scale_floor, int kind)"
         " -> Tensor[]");
@@ -146,16 +131,10 @@ TORCH_LIBRARY_FRAGMENT(sw_anchors, m) {
         " float base, bool context) -> Tensor[]");
 }
 
-TORCH_LIBRARY_IMPL(sw_anchors, CPU, m) {
+TORCH_LIBRARY_IMPL(sw_hac, CUDA, m) {
   m.impl("mixture_bits", mixture_bits);
   m.impl("channel_inputs", channel_inputs);
   m.impl("channel_slopes", channel_slopes);
 }
 
-#ifdef SW_WITH_CUDA
-TORCH_LIBRARY_IMPL(sw_anchors, CUDA, m) {
-  m.impl("mixture_bits", mixture_bits);
-  m.impl("channel_inputs", channel_inputs);
-  m.impl("channel_slopes", channel_slopes);
-}
-#endif
+#endif  // SW_WITH_CUDA

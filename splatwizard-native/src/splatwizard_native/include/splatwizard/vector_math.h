@@ -1,7 +1,7 @@
 // Functions of probability on vectors of float32.
 #pragma once
 
-#include "vectors.h"
+#include <splatwizard/vectors.h>
 
 namespace SW_ARCH {
 

@@ -5,11 +5,11 @@
 #include <vector>
 
 #include "kernels.h"
-#include "vector_math.h"
+#include <splatwizard/vector_math.h>
 
 namespace SW_ARCH {
 
-using namespace sw_anchors;
+using namespace sw_hac;
 
 namespace {
 

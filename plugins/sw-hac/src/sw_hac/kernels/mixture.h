@@ -13,7 +13,7 @@
 #define SW_MIXTURE_HD inline __attribute__((always_inline))
 #endif
 
-namespace sw_anchors {
+namespace sw_hac {
 
 // What masks do to the bits of their anchor. kAlone: those of an offset are multiplied by its mask, and its mask has
 // them as its gradient. kGated: an anchor without masks has no bits at all. kGatedMean: and all its bits are multiplied
@@ -194,4 +194,4 @@ SW_MIXTURE_HD TwoBits<Math> two_bits(Real x, Real step, Real factor, const Norma
           to_a * other * (a.value - b.value)};
 }
 
-}  // namespace sw_anchors
+}  // namespace sw_hac

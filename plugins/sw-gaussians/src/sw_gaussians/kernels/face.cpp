@@ -1,0 +1,20 @@
+#include "face.h"
+
+#include "kernels.h"
+
+using splatwizard::refuse;
+
+SW_OPERATION(splatwizard_gaussians, sparse_adam) {
+  return splatwizard::guarded(call, [&](const splatwizard::Parallel& parallel) {
+    for (int64_t i = 0; i < call->count; ++i)
+      if (call->updates[i].width < 0) refuse("update %lld has rows of %lld numbers", (long long)i,
+                                             (long long)call->updates[i].width);
+    for (int64_t i = 0; i < call->count; ++i) {
+      const sparse_update& u = call->updates[i];
+      const splatwizard::SparseAdamArgs args{
+          u.param, u.grad, u.exp_avg, u.exp_avg_sq, call->marked, call->rows, u.width, float(u.lr),
+          float(1. - u.beta1), float(u.beta2), float(1. - u.beta2), float(u.eps)};
+      SW_SELECT(sparse_adam)(args, parallel);
+    }
+  });
+}

@@ -1,0 +1,40 @@
+"""Every package with kernels can put them, compiled, into its wheel."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tools"))
+
+import build_wheels  # noqa: E402
+
+WITH_KERNELS = [
+    package
+    for package in build_wheels.packages([])
+    if any(build_wheels.DECLARES.search(path.read_text("utf-8")) for path in (package / "src").rglob("*native.py"))
+]
+
+
+def test_packages_with_kernels_are_found():
+    assert {package.name for package in WITH_KERNELS} >= {"splatwizard-native", "sw-codecs", "sw-rasterizers"}
+
+
+@pytest.mark.parametrize("package", WITH_KERNELS, ids=lambda package: package.name)
+def test_its_wheel_takes_them_and_tells_the_platform(package):
+    project = (package / "pyproject.toml").read_text("utf-8")
+    assert 'artifacts = ["**/prebuilt/*.so", "**/prebuilt/*.json"]' in project
+    assert "\n[tool.hatch.build.targets.wheel.hooks.custom]\n" in project
+    hook = (package / "hatch_build.py").read_text("utf-8")
+    assert hook == (ROOT / "splatwizard-native" / "hatch_build.py").read_text("utf-8")
+
+
+def test_the_tag_names_the_newest_glibc_of_all_libraries(tmp_path):
+    for name, symbols in (("a.so", b"\0GLIBC_2.2.5\0GLIBC_2.34\0"), ("b.so", b"\0GLIBC_2.29\0GLIBCXX_3.4.30\0")):
+        (tmp_path / name).write_bytes(symbols)
+    libraries = sorted(tmp_path.iterdir())
+    assert re.fullmatch(r"manylinux_2_34_aarch64", build_wheels.platform_of(libraries, "aarch64"))

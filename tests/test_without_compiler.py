@@ -1,0 +1,80 @@
+"""Our wheels where no compiler is: kernels come with them, and the first table costs seconds more than the second."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from fresh_environments import ROOT, FreshEnvironment, make_environment
+
+from splatwizard_native import CompilerMissingError, find_compiler
+
+pytestmark = pytest.mark.slow
+RUN = (
+    "run", "--method", "chimerags", "--scene", "demo", "--preset", "quick", "--set", "iterations=300",
+    "--set", "train.stop=100", "--set", "distill.iterations=60",
+)  # fmt: skip
+MOST_MORE = 30.0
+"""Seconds that install and first run may take beyond a second run."""
+
+
+@pytest.fixture(scope="module")
+def wheels(tmp_path_factory) -> list[Path]:
+    try:
+        find_compiler()
+    except CompilerMissingError as error:
+        pytest.skip(f"the wheels cannot be built here: {error}")
+    out = tmp_path_factory.mktemp("wheels")
+    subprocess.run([sys.executable, ROOT / "tools" / "build_wheels.py", "--out", out], check=True)
+    return sorted(out.iterdir())
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory) -> FreshEnvironment:
+    """Torch and what else is needed are there, ours is not."""
+    return make_environment(tmp_path_factory.mktemp("without") / "env")
+
+
+def without_compiler(environment: FreshEnvironment, cache: Path) -> dict[str, str]:
+    """Variables under which no command is found but the environment's own, and nothing was built before."""
+    return {"PATH": str(environment.prefix / "bin"), "CXX": "", "SPLATWIZARD_CACHE": str(cache)}
+
+
+def test_a_first_table_and_a_page_need_no_compiler(wheels, environment, tmp_path):
+    around = without_compiler(environment, tmp_path / "cache")
+    started = time.monotonic()
+    environment.install(*wheels)
+    done = environment.run(*RUN, "--out", str(tmp_path / "first"), **around)
+    cold = time.monotonic() - started
+    assert "compil" not in done.stdout + done.stderr
+    started = time.monotonic()
+    environment.run(*RUN, "--out", str(tmp_path / "second"), **around)
+    warm = time.monotonic() - started
+    print(f"install and first run {cold:.1f} s, second run {warm:.1f} s")
+    assert cold - warm < MOST_MORE
+    (file,) = (tmp_path / "first").rglob("*.swz")
+    environment.run("export", str(file), str(tmp_path / "page.html"), **around)
+    assert b"<canvas" in (tmp_path / "page.html").read_bytes()
+    assert not list((tmp_path / "cache").rglob("*.so"))
+
+
+def test_a_wheel_has_the_same_bytes_wherever_it_is_built(wheels, tmp_path):
+    environment = {**os.environ, "SPLATWIZARD_CACHE": str(tmp_path / "cache"), "TMPDIR": str(tmp_path)}
+    tool = [sys.executable, ROOT / "tools" / "build_wheels.py", "--out", tmp_path / "again", "splatwizard-native"]
+    subprocess.run(tool, env=environment, check=True)
+    (again,) = (tmp_path / "again").iterdir()
+    (before,) = (wheel for wheel in wheels if wheel.name == again.name)
+    assert again.read_bytes() == before.read_bytes()
+
+
+def test_the_doctor_says_of_each_module_that_it_is_prebuilt(wheels, environment, tmp_path):
+    around = without_compiler(environment, tmp_path / "cache")
+    found = json.loads(environment.run("doctor", "--json", check=False, **around).stdout)
+    kernels = {check["name"]: check for check in found["checks"] if check["group"] == "kernels"}
+    assert len(kernels) >= 7
+    assert {check["facts"]["state"] for check in kernels.values()} == {"prebuilt"}
