@@ -1,4 +1,4 @@
-"""What one drawing is about, besides its tensors to differentiate by."""
+"""Arguments of one drawing, besides the tensors to differentiate by."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ Tensors = dict[str, Any]
 
 
 class Kept(NamedTuple):
-    """What a drawing keeps for its backward pass.
+    """State of a drawing that its backward pass needs.
 
     splats, lists   bytes, in tensors
     pairs           of a splat and a tile
@@ -54,7 +54,7 @@ class Drawn(NamedTuple):
 
 
 class Projected(NamedTuple):
-    """What `project` found: bytes, tiles of all pairs, radii, counts."""
+    """Results of `project`: bytes, tiles of all pairs, radii, counts."""
 
     splats: Tensor
     tiles: Tensor
@@ -88,7 +88,7 @@ class Picture:
 
 
 class _Listed:
-    """How many pairs calls had of late: a guess at how many the next one has."""
+    """Number of pairs of recent calls: a guess at that of the next one."""
 
     recent = 0
 

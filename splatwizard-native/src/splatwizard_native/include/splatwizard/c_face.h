@@ -16,6 +16,7 @@
 // Memory is always the caller's. Where a size depends on data there are two operations, one that counts and one that
 // fills. `sw_real*` is float32 or float64, the same for all of a call, told by its `real_bytes`.
 #pragma once
+#include <stdbool.h>
 #include <stddef.h>
 #include <stdint.h>
 
