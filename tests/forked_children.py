@@ -16,22 +16,29 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import select
+import signal
 import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+import threading
+from collections.abc import Iterator, Mapping
 from types import SimpleNamespace
-from typing import Any
+from typing import IO, Any
 
 import splatwizard_core.runs.fresh
 
-MODULES = ("splatwizard_core.cli.fresh_child", "splatwizard_core")
+MODULES = (
+    "splatwizard_core.cli.fresh_child", "splatwizard_core", "sw_bench.child", "sw_doctor.probe", "sw_doctor.imports",
+    "sw_doctor.child_check",
+)  # fmt: skip
 PLAIN = (
     "SW_", "SPLATWIZARD_", "PYTHONPATH", "PYTEST_", "COV_", "TEST_", "TMPDIR", "HOME", "XDG_", "TORCH_HOME", "COLUMNS",
-    "PATH", "CXX",
+    "PATH", "CXX", "TOY_", "OMP_NUM_THREADS", "PYTHONDONTWRITEBYTECODE",
 )  # fmt: skip
 """Variables that mean the same to a process that reads them late; any other difference needs a new interpreter."""
+START = subprocess.run
 
 
 def run_python(*arguments: str, **options: Any) -> subprocess.CompletedProcess[str]:
@@ -46,6 +53,72 @@ def run_python(*arguments: str, **options: Any) -> subprocess.CompletedProcess[s
     return ran
 
 
+def start_python(*arguments: str, **options: Any) -> Any:
+    """Start what `run_python` runs and return its `Popen`; options are those of `Forked`."""
+    started = splatwizard_core.runs.fresh.subprocess.Popen
+    return started([sys.executable, *arguments], **options)
+
+
+class Forked:
+    """What `subprocess.Popen` is, of a forked child: its pid, pipes, signals and end.
+
+    ended       the end of a pipe that tells its pid, then its status
+    """
+
+    def __init__(self, ended: int, pipes: Mapping[str, IO[Any] | None]) -> None:
+        self._ended = os.fdopen(ended, "rb", buffering=0)
+        self._told = b""
+        while not self._told.endswith(b" "):
+            self._read()
+        self.pid = int(self._told)
+        self._told, self._one_reads = b"", threading.Lock()
+        self.stdin, self.stdout, self.stderr = (pipes.get(name) for name in ("stdin", "stdout", "stderr"))
+        self.returncode: int | None = None
+
+    def _read(self) -> bool:
+        told = self._ended.read(1)
+        if not told and not self._told:
+            raise RuntimeError("the server that forks fresh processes has died")
+        self._told += told
+        return bool(told)
+
+    def wait(self, timeout: float | None = None) -> int:
+        with self._one_reads:
+            while self.returncode is None:
+                if not select.select([self._ended], [], [], timeout)[0]:
+                    raise subprocess.TimeoutExpired("a forked child", timeout or 0)
+                if not self._read():
+                    self.returncode = int(self._told)
+                    self._ended.close()
+            return self.returncode
+
+    def poll(self) -> int | None:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.wait(0)
+        return self.returncode
+
+    def communicate(self, timeout: float | None = None) -> tuple[Any, Any]:
+        """All that it prints, where at most one of both streams is long."""
+        if timeout is not None:
+            self.wait(timeout)
+        told = tuple(None if pipe is None or pipe.closed else pipe.read() for pipe in (self.stdout, self.stderr))
+        self.wait()
+        return told
+
+    def send_signal(self, number: int) -> None:
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def kill(self) -> None:
+        self.send_signal(signal.SIGKILL)
+
+    def __enter__(self) -> Forked:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.wait()
+
+
 class ForkServer:
     """The server's process, started with the first request and ended with its socket.
 
@@ -55,41 +128,77 @@ class ForkServer:
     def __init__(self, connection: socket.socket | None = None, environment: Mapping[str, str] | None = None) -> None:
         self._server: subprocess.Popen[bytes] | None = None
         self._socket = connection
+        self._one_begins = threading.Lock()
         self._environment = dict(os.environ if environment is None else environment)
 
-    def run(self, command: Sequence[str], **options: Any) -> subprocess.CompletedProcess[str]:
-        """Do what `subprocess.run` does, of the command and the options that `run_fresh` and `run_python` use."""
-        environment = dict(os.environ) if options["env"] is None else options["env"]
+    def run(self, command: Any, **options: Any) -> subprocess.CompletedProcess[Any]:
+        """Do what `subprocess.run` does; forked where the command and its surroundings allow it."""
+        work = self._work_of(command, options)
+        if work is None:
+            return START(command, **options)
+        with contextlib.ExitStack() as open_files:
+            given, out, err = (open_files.enter_context(tempfile.TemporaryFile()) for _ in range(3))
+            text, said = options.get("text", False), options.get("input") or b""
+            given.write(said.encode() if isinstance(said, str) else said)
+            given.seek(0)
+            kept = subprocess.PIPE if options.get("capture_output") else None
+            ends = {"stdin": given, "stdout": out, "stderr": err} | {
+                name: number
+                for name, number in (("stdin", options.get("stdin")), ("stderr", options.get("stderr", kept)))
+                if number not in (subprocess.PIPE, None) or (name, number) == ("stderr", None)
+            }
+            status = self._fork(work, options, ends).wait()
+            printed = []
+            for file in (out, err):
+                file.seek(0)
+                printed.append(file.read().decode() if text else file.read())
+        done = subprocess.CompletedProcess(command, status, *printed)
+        if options.get("check"):
+            done.check_returncode()
+        return done
+
+    def popen(self, command: Any, **options: Any) -> Any:
+        """Do what `subprocess.Popen` does; a `Forked` where the command and its surroundings allow it."""
+        work = self._work_of(command, options)
+        return subprocess.Popen(command, **options) if work is None else self._fork(work, options, options)
+
+    def _work_of(self, command: Any, options: Mapping[str, Any]) -> dict[str, Any] | None:
+        environment = dict(os.environ) if options.get("env") is None else dict(options["env"])
         work = _work(command)
         if work is None or not self._serves(environment):
-            return subprocess.run(command, **options)
-        with contextlib.ExitStack() as open_files:
-            given, out, err = (open_files.enter_context(tempfile.TemporaryFile("w+")) for _ in range(3))
-            given.write(options.get("input", ""))
-            given.seek(0)
+            return None
+        folder = str(options.get("cwd") or os.getcwd())
+        session = bool(options.get("start_new_session"))
+        return {**work, "environment": environment, "folder": folder, "session": session, "parent": os.getpid()}
+
+    def _fork(self, work: dict[str, Any], options: Mapping[str, Any], wanted: Mapping[str, Any]) -> Forked:
+        """Ask for a child whose streams are files, descriptors, or pipes to here."""
+        mode, pipes, theirs = "" if options.get("text") else "b", {}, []
+        with contextlib.ExitStack() as until_sent:
+            for number, name in enumerate(("stdin", "stdout", "stderr")):
+                file = wanted.get(name)
+                if file == subprocess.PIPE:
+                    ends = os.pipe()
+                    pipes[name] = os.fdopen(ends[number == 0], ("w" if number == 0 else "r") + mode)
+                    file = ends[number != 0]
+                    until_sent.callback(os.close, file)
+                elif file == subprocess.DEVNULL:
+                    file = until_sent.enter_context(open(os.devnull, "r+b")).fileno()
+                elif file == subprocess.STDOUT:
+                    file = theirs[1]
+                elif file is None:
+                    file = number
+                theirs.append(file if isinstance(file, int) else file.fileno())
             ended, end = os.pipe()
-            stderr = err.fileno() if options["stderr"] == subprocess.PIPE else 2
-            request = {**work, "environment": environment, "folder": str(options["cwd"] or os.getcwd())}
-            try:
-                self._send(
-                    json.dumps(request).encode(),
-                    [options.get("stdin", given.fileno()), out.fileno(), stderr, end],
-                )
-            finally:
-                os.close(end)
-            with open(ended, "rb") as status:
-                told = status.read()
-            if not told:
-                raise RuntimeError("the server that forks fresh processes has died")
-            out.seek(0)
-            err.seek(0)
-            return subprocess.CompletedProcess(command, int(told), out.read(), err.read())
+            until_sent.callback(os.close, end)
+            self._send(json.dumps(work).encode(), [*theirs, end])
+        return Forked(ended, pipes)
 
     def _serves(self, environment: Mapping[str, str]) -> bool:
         differing = dict(environment.items() ^ self._environment.items())
         return all(name.startswith(PLAIN) for name in differing)
 
-    def _send(self, request: bytes, files: list[int]) -> None:
+    def _begin(self) -> socket.socket:
         if self._socket is None:
             self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             with theirs:
@@ -99,11 +208,16 @@ class ForkServer:
                     stdin=subprocess.DEVNULL,
                     env=self._environment,  # not that of the test which asks first
                 )
+        return self._socket
+
+    def _send(self, request: bytes, files: list[int]) -> None:
+        with self._one_begins:
+            connection = self._begin()
         with tempfile.TemporaryFile() as text:  # an environment may be longer than a packet
             text.write(request)
             text.flush()
             try:
-                socket.send_fds(self._socket, [b"run"], [text.fileno(), self._socket.fileno(), *files])
+                socket.send_fds(connection, [b"run"], [text.fileno(), connection.fileno(), *files])
             except OSError as error:
                 raise RuntimeError("the server that forks fresh processes has died") from error
 
@@ -115,9 +229,11 @@ class ForkServer:
             self._server = self._socket = None
 
 
-def _work(command: Sequence[str]) -> dict[str, Any] | None:
+def _work(command: Any) -> dict[str, Any] | None:
     """What a forked child does in place of the command, None if only a new process can."""
-    python, kind, what, *arguments = command
+    if not isinstance(command, (list, tuple)) or len(command) < 3:
+        return None
+    python, kind, what, *arguments = map(str, command)
     if python != sys.executable or (kind != "-c" and (kind != "-m" or what not in MODULES)):
         return None
     return {"program" if kind == "-c" else "module": what, "arguments": arguments}
@@ -131,7 +247,7 @@ def forking() -> Iterator[None]:
         return
     server, fresh = ForkServer(), splatwizard_core.runs.fresh
     before = fresh.subprocess
-    fresh.subprocess = SimpleNamespace(run=server.run, PIPE=subprocess.PIPE)  # type: ignore[assignment]
+    fresh.subprocess = SimpleNamespace(**{**vars(subprocess), "run": server.run, "Popen": server.popen})  # type: ignore[assignment]
     try:
         yield
     finally:
@@ -155,8 +271,6 @@ def _serve(connection: socket.socket) -> tuple[dict[str, Any], int]:
 
     The server itself never returns.
     """
-    import signal
-
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # whoever asked is interrupted, and its child
     while True:
         _, files, _, _ = socket.recv_fds(connection, 16, 6)
@@ -167,8 +281,8 @@ def _serve(connection: socket.socket) -> tuple[dict[str, Any], int]:
             child = os.fork()
             if child == 0:
                 break
-            told = str(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])).encode()
-            os.write(ends[3], told)
+            os.write(ends[3], f"{child} ".encode())
+            os.write(ends[3], str(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])).encode())
             os._exit(0)
         for file in files:
             os.close(file)
@@ -199,10 +313,19 @@ def _become(content: dict[str, Any], asking: int, ours: list[str]) -> None:
     np.random.seed()  # a new interpreter draws both seeds anew; `random` does so after each fork
     torch.seed()
     os.chdir(content["folder"])
-    again = ForkServer(socket.socket(fileno=asking), os.environ)
-    splatwizard_core.runs.fresh.subprocess = SimpleNamespace(run=again.run, PIPE=subprocess.PIPE)  # type: ignore[assignment]
+    for number, name in enumerate(("stdin", "stdout", "stderr")):  # the server's know whether its own can seek
+        stream = getattr(sys, name)
+        kind = {"encoding": stream.encoding, "errors": stream.errors, "closefd": False}
+        setattr(sys, name, open(number, "w" if number else "r", buffering=1 if number == 2 else -1, **kind))  # noqa: SIM115
+    subprocess.run = ForkServer(socket.socket(fileno=asking), os.environ).run  # type: ignore[assignment]
+    os.getppid = lambda: content["parent"]
+    if content["session"]:
+        os.setsid()
     os.environ.clear()
     os.environ.update(content["environment"])
+    sys.dont_write_bytecode = bool(os.environ.get("PYTHONDONTWRITEBYTECODE"))
+    if (threads := os.environ.get("OMP_NUM_THREADS", "")).isdecimal():
+        torch.set_num_threads(int(threads))
     paths = filter(None, content["environment"].get("PYTHONPATH", "").split(os.pathsep))
     sys.path[:] = list(dict.fromkeys([content["folder"], *map(os.path.abspath, paths), *ours]))
     sys.argv[:] = ["-c", *content["arguments"]]

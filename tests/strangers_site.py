@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import subprocess
-import sys
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from forked_children import run_python
+from forked_children import run_python, start_python
 
 
 @dataclass(frozen=True)
@@ -80,15 +78,10 @@ class Site:
 
     def start(self, *arguments: str, **env: str) -> subprocess.Popen[str]:
         """Start `sw ARGUMENTS` as a foreground process of a terminal would run: Ctrl-C (SIGINT) reaches it."""
-
-        def heed_interrupts() -> None:
-            # What a shell started in the background ignores, its children ignore too.
-            signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-        return subprocess.Popen(
-            [sys.executable, "-m", "splatwizard_core", *arguments], cwd=self.folder, env=self._environment(env),
-            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, preexec_fn=heed_interrupts,
-        )  # fmt: skip
+        streams = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
+        surroundings = {"cwd": self.folder, "env": self._environment(env)}
+        started: subprocess.Popen[str] = start_python("-m", "splatwizard_core", *arguments, **surroundings, **streams)
+        return started
 
     def listed(self, **env: str) -> Listed:
         """`sw list-plugins --json`."""

@@ -50,7 +50,8 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> tuple[subprocess.Complete
     except NativeBuildError:
         return doctor("--json"), []
     noting.chmod(0o755)
-    return doctor("--json", CXX=str(noting)), asked.read_text().splitlines()
+    with forked_children.starting():
+        return doctor("--json", CXX=str(noting)), asked.read_text().splitlines()
 
 
 def test_this_machine_can_do_the_main_job(sound):

@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 from sw_datasets.demo.synthetic import SIZES
 
+import splatwizard_core.runs.fresh
 from splatwizard_core.cli.main import main
 
 ROOT = Path(__file__).parent.parent
@@ -93,6 +94,7 @@ def documented(page: str) -> list[str]:
 def test_every_sw_command_of_the_page_succeeds_in_the_order_of_the_page(
     page: str, working_directory: Path, small_demo, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    monkeypatch.setattr("sw_doctor.child.subprocess", splatwizard_core.runs.fresh.subprocess)  # as the tests' own
     monkeypatch.chdir(working_directory)
     monkeypatch.setenv("SPLATWIZARD_DATA", str(working_directory / "path" / "to" / "data"))
     shutil.rmtree(working_directory / "out", ignore_errors=True)

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import os
 import shlex
-import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
 import torch
+from forked_children import run_python
 from wrong_things import make_things
 
 from splatwizard_core.cli.main import command_entries, main
@@ -390,10 +389,7 @@ IN_A_PROCESS = ("rum", "decode {cut.swz}")
 @pytest.mark.parametrize("row", [row for row in ROWS if row.line in IN_A_PROCESS], ids=str)
 def test_wrong_input_to_a_real_process(row: Row, things: Path, tmp_path: Path, surroundings):
     before = tree(things, tmp_path)
-    done = subprocess.run(
-        [sys.executable, "-m", "splatwizard_core", *shlex.split(filled(row.line, things, tmp_path))],
-        capture_output=True, text=True, timeout=300, check=False,
-    )  # fmt: skip
+    done = run_python("-m", "splatwizard_core", *shlex.split(filled(row.line, things, tmp_path)))
     assert_told(done.stderr, done.stdout, filled(row.told, things, tmp_path))
     assert done.returncode == row.status
     assert tree(things, tmp_path) == before

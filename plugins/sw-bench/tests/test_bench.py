@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+import splatwizard_core.runs.fresh
 from splatwizard_core.cli.main import main
 
 pytest.importorskip("sw_3dgs", reason="a sweep needs a method")
@@ -61,7 +62,9 @@ def swept(tmp_path_factory):
     picture = next((folder / "spoilt").rglob("*.png"))
     picture.write_bytes(picture.read_bytes()[:300])
     (folder / "plan.toml").write_text(PLAN.format(scene=folder / "spoilt", steps=3))
-    return folder, main(["bench", str(folder / "plan.toml"), "--out", str(folder / "out")])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sw_bench.local.subprocess", splatwizard_core.runs.fresh.subprocess)
+        return folder, main(["bench", str(folder / "plan.toml"), "--out", str(folder / "out")])
 
 
 @pytest.mark.pipeline

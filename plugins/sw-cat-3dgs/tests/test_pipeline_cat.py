@@ -1,12 +1,11 @@
 """CAT-3DGS on the small procedural scene: it learns, resumes, and its file has the size that it estimates."""
 
 import contextlib
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 import torch
+from forked_children import run_python
 from sw_anchors.coded_anchors import ENTROPY
 from sw_kit.forged_files import forged
 from sw_kit.short_training import file_of, psnr
@@ -102,7 +101,7 @@ def test_a_fresh_process_decodes_the_same_model(method, trained, tmp_path):
         "from splatwizard_core.plugins import load_plugins\n"
         "print(open_model(sys.argv[1], load_plugins(), torch.device('cpu'))[0].digest())"
     )
-    found = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True)
+    found = run_python("-c", code, str(path), check=True)
     assert found.stdout.split()[-1] == decoded(path.read_bytes()).digest()
 
 

@@ -4,12 +4,14 @@ import json
 import os
 import signal
 import subprocess
-import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
+import psutil
 import pytest
 import torch
+from forked_children import start_python
 from sw_gaussians.ply import export_ply
 from sw_gaussians.start import gaussians_from_points
 
@@ -310,10 +312,8 @@ def test_a_finished_student_is_encoded_from_its_directory(toy_plugins, tmp_path,
 
 
 def sw_train(method: str, out: Path, **environment: str) -> "subprocess.Popen[str]":
-    return subprocess.Popen(
-        [sys.executable, "-m", "splatwizard_core", "train", "--method", method, "--scene", "demo:tiny", "--out", out],
-        env={**os.environ, **environment}, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+    command = ["-m", "splatwizard_core", "train", "--method", method, "--scene", "demo:tiny", "--out", str(out)]
+    return start_python(*command, env={**os.environ, **environment}, stderr=subprocess.PIPE, text=True)
 
 
 @pytest.mark.parametrize("first", ["toy-student", "toy"])
@@ -326,8 +326,11 @@ def test_two_processes_that_want_the_same_scene_train_it_once(toy_plugins, tmp_p
     one = sw_train(
         first, tmp_path, TOY_DEATH="train:/checkpoints", TOY_SIGNAL=stop, TOY_WRITES=str(tmp_path / "writes")
     )
-    _, status = os.waitpid(one.pid, os.WUNTRACED)
-    assert os.WIFSTOPPED(status), one.communicate()
+    until = time.monotonic() + 300
+    while psutil.Process(one.pid).status() != psutil.STATUS_STOPPED:
+        assert one.poll() is None, one.communicate()
+        assert time.monotonic() < until
+        time.sleep(0.01)
     two = sw_train("toy-taught", tmp_path)
     assert two.stderr is not None
     lines: list[str] = []

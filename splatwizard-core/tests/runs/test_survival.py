@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from forked_children import run_python, start_python
 
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.training.checkpoint import CheckpointStore
@@ -108,27 +109,40 @@ class Life:
         self.log.append(told)
         return process.returncode
 
-    def start(self, death: str | None = None) -> subprocess.Popen[str]:
+    @property
+    def command(self) -> list[str]:
+        return ["-m", "splatwizard_core", *RUN, "--out", str(self.folder / "out")]
+
+    def environment(self, death: str | None = None) -> dict[str, str]:
         temporary = self.folder / "tmp"
         temporary.mkdir(parents=True, exist_ok=True)
         environment = {**os.environ, "TMPDIR": str(temporary), "PYTHONDONTWRITEBYTECODE": "1"}
         if death is not None:
             environment |= {"TOY_DEATH": death, "TOY_WRITES": str(self.folder / "writes")}
+        return environment
+
+    def start(self) -> subprocess.Popen[str]:
+        """Begin in a new interpreter, importing included."""
         return subprocess.Popen(
-            [sys.executable, "-m", "splatwizard_core", *RUN, "--out", str(self.folder / "out")],
-            env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True,
+            [sys.executable, *self.command], env=self.environment(), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+            text=True, start_new_session=True,
         )  # fmt: skip
 
-    def live(self, death: str | None = None, *, after: float | None = None) -> int:
-        """Run until the end, the death before a write, or a kill after some seconds; the exit status."""
-        process = self.start(death)
+    def live(self, death: str | None = None) -> int:
+        """Run until the end, or the death before a write; the exit status."""
+        done = run_python(*self.command, env=self.environment(death))
+        self.log.append(done.stderr)
+        return done.returncode
+
+    def kill(self, after: float) -> None:
+        """Kill a run after some seconds, if it has not ended by then."""
+        process = self.start()
         try:
             _, told = process.communicate(timeout=after)
         except subprocess.TimeoutExpired:
             process.kill()
             _, told = process.communicate()
         self.log.append(told)
-        return process.returncode
 
     @property
     def writes(self) -> list[str]:
@@ -196,10 +210,8 @@ def undisturbed(toy_plugins: PluginManager, tmp_path_factory: pytest.TempPathFac
 def reader(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     """Another process that reads everything in the run directory of Life(tmp_path) again and again."""
     directory = Life(tmp_path).directory
-    process = subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(READER), str(directory), str(tmp_path / "stop")],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    process = start_python("-c", textwrap.dedent(READER), str(directory), str(tmp_path / "stop"), **pipes)
     assert process.stdout is not None
     assert process.stdout.readline() == "looks\n"
     yield process
@@ -250,7 +262,7 @@ def test_a_run_that_is_killed_anywhere_comes_to_the_same(point: int, undisturbed
         assert status == -signal.SIGKILL, life.log
     else:
         # One slice of its time for each point, so that all of it is met.
-        life.live(after=undisturbed.seconds * (point + 2 * dice.random()) / POINTS)
+        life.kill(after=undisturbed.seconds * (point + 2 * dice.random()) / POINTS)
     assert life.live() == 0, life.log
     assert life.left() == []
     assert outcome(life.directory) == undisturbed.outcome
