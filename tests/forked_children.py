@@ -35,9 +35,12 @@ MODULES = (
 )  # fmt: skip
 PLAIN = (
     "SW_", "SPLATWIZARD_", "PYTHONPATH", "PYTEST_", "COV_", "TEST_", "TMPDIR", "HOME", "XDG_", "TORCH_HOME", "COLUMNS",
-    "PATH", "CXX", "TOY_", "OMP_NUM_THREADS", "PYTHONDONTWRITEBYTECODE",
+    "PATH", "CXX", "TOY_", "OMP_NUM_THREADS", "PYTHONDONTWRITEBYTECODE", "TORCHINDUCTOR_", "CUBLAS_WORKSPACE_CONFIG",
 )  # fmt: skip
-"""Variables that mean the same to a process that reads them late; any other difference needs a new interpreter."""
+"""Variables that mean the same to a process that reads them late; any other difference needs a new interpreter.
+
+The last two are set by a training: without them every run after the first training of a session would get one.
+"""
 START = subprocess.run
 
 
@@ -317,7 +320,11 @@ def _become(content: dict[str, Any], asking: int, ours: list[str]) -> None:
         stream = getattr(sys, name)
         kind = {"encoding": stream.encoding, "errors": stream.errors, "closefd": False}
         setattr(sys, name, open(number, "w" if number else "r", buffering=1 if number == 2 else -1, **kind))  # noqa: SIM115
-    subprocess.run = ForkServer(socket.socket(fileno=asking), os.environ).run  # type: ignore[assignment]
+    again = ForkServer(socket.socket(fileno=asking), os.environ)
+    if "module" in content:  # of a program, which may be pytest, only what `run_fresh` starts is forked
+        subprocess.run = again.run  # type: ignore[assignment]
+    else:
+        splatwizard_core.runs.fresh.subprocess = SimpleNamespace(**{**vars(subprocess), "run": again.run})  # type: ignore[assignment]
     os.getppid = lambda: content["parent"]
     if content["session"]:
         os.setsid()

@@ -50,8 +50,7 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> tuple[subprocess.Complete
     except NativeBuildError:
         return doctor("--json"), []
     noting.chmod(0o755)
-    with forked_children.starting():
-        return doctor("--json", CXX=str(noting)), asked.read_text().splitlines()
+    return doctor("--json", CXX=str(noting)), asked.read_text().splitlines()
 
 
 def test_this_machine_can_do_the_main_job(sound):

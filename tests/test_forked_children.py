@@ -1,6 +1,8 @@
 """A forked process of a run is what a new interpreter would be: same folder, variables, path, plugins, exit status."""
 
 import os
+import signal
+import subprocess
 import sys
 from pathlib import Path
 
@@ -12,6 +14,8 @@ from splatwizard_core.runs.fresh import FreshProcessError, run_fresh
 
 STRANGER = '''
 import os
+import signal
+import subprocess
 import sys
 
 import click
@@ -98,3 +102,28 @@ def test_another_locale_gets_a_new_interpreter(monkeypatch: pytest.MonkeyPatch, 
     run_fresh(["whereabouts"], alone_in=tmp_path)
     monkeypatch.setenv("PYTHONIOENCODING", "latin-1")
     assert run_fresh(["whereabouts"], alone_in=tmp_path)["environment"]["PYTHONIOENCODING"] == "latin-1"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="forks on Linux alone")
+def test_what_a_training_sets_costs_no_new_interpreter(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    with forked_children.forking():
+        monkeypatch.setenv("CUBLAS_WORKSPACE_CONFIG", ":16:8")
+        monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
+        monkeypatch.setattr(forked_children, "START", None)
+        assert run_fresh(["whereabouts"], alone_in=tmp_path)["environment"]["CUBLAS_WORKSPACE_CONFIG"] == ":16:8"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="forks on Linux alone")
+def test_it_is_started_stopped_and_killed_as_any_process():
+    program = "import sys; print(sys.stdin.readline().strip(), flush=True); sys.stdin.read()"
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "start_new_session": True}
+    with forked_children.start_python("-c", program, **pipes) as child:
+        child.stdin.write("hello\n")
+        child.stdin.flush()
+        assert child.stdout.readline() == "hello\n"
+        assert os.getsid(child.pid) == child.pid
+        assert child.poll() is None
+        with pytest.raises(subprocess.TimeoutExpired):
+            child.wait(0.01)
+        child.kill()
+        assert child.wait() == -signal.SIGKILL

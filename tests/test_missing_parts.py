@@ -2,11 +2,11 @@
 release than the one that wrote it."""
 
 import os
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from forked_children import run_python
 
 from splatwizard_core.cli.main import main
 from splatwizard_core.coding.container import ContainerReader
@@ -117,10 +117,8 @@ def test_a_codec_that_is_left_out(file, stranger, capsys, monkeypatch):
 
 def test_a_codec_that_is_left_out_of_another_process(file, stranger):
     program = "import sys; from splatwizard_core.cli.main import main; sys.exit(main(sys.argv[1:]))"
-    done = subprocess.run(
-        [sys.executable, "-c", program, "decode", str(file), "--repeats", "0"], capture_output=True, text=True,
-        env={**os.environ, "SW_PLUGINS": OURS, "PYTHONPATH": ":".join(sys.path)}, timeout=1200,
-    )  # fmt: skip
+    surroundings = {**os.environ, "SW_PLUGINS": OURS, "PYTHONPATH": ":".join(sys.path)}
+    done = run_python("-c", program, "decode", str(file), "--repeats", "0", env=surroundings)
     assert done.returncode == 2
     assert "needs coder 'martian', which is not installed: sw-martian 1.2 is there, but SW_PLUGINS" in done.stderr
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import os
 import re
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from forked_children import run_python
 from neighbours import ROOT, put_neighbours
 
 pytestmark = pytest.mark.pipeline
@@ -25,13 +25,24 @@ COUNTING = [
 ASKING = re.compile(r"load_plugins|command_entries|entry_points|is_ours")
 
 
+COLLECTING = f"""
+import sys, pytest
+
+class Plugin:
+    def pytest_collection_modifyitems(self, items):
+        print(*(f"collected {{item.nodeid}}" for item in items), sep="\\n")
+        items[:] = [item for item in items if item.nodeid.startswith({tuple(COUNTING)})]
+
+sys.exit(pytest.main(sys.argv[1:], [Plugin()]))
+"""
+"""Program that tells every test it collects and runs those alone that go over everything."""
+
+
 def run_pytest(folder: Path, *arguments: str) -> str:
     """Run tests of this repository with the neighbours installed; return what pytest prints."""
     path = os.pathsep.join([*map(str, put_neighbours(folder)), *filter(None, sys.path)])
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", *arguments],
-        cwd=ROOT, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, timeout=1200,
-    )  # fmt: skip
+    words = ["-q", "-p", "no:cacheprovider", "-p", "no:xdist", *arguments]
+    done = run_python("-c", COLLECTING, *words, cwd=ROOT, env={**os.environ, "PYTHONPATH": path})
     assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-2000:]
     return done.stdout
 
@@ -40,27 +51,29 @@ def test_the_neighbours_are_there(tmp_path):
     """Else what follows would say nothing."""
     path = os.pathsep.join([*map(str, put_neighbours(tmp_path)), *filter(None, sys.path)])
     program = "from splatwizard_core.plugins import load_plugins as l; print(*l().methods.names, len(l().broken))"
-    done = subprocess.run(
-        [sys.executable, "-c", program],
-        env={**os.environ, "PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    done = run_python("-c", program, env={**os.environ, "PYTHONPATH": path}, check=True)
     assert {"neighbour-methods", "opacity-prune"} < set(done.stdout.split())
     assert done.stdout.split()[-1] == "0"
 
 
-def test_no_test_is_made_for_what_is_theirs(tmp_path):
-    """Of files that can ask what is installed: the others name what they go over."""
+@pytest.fixture(scope="module")
+def ran(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """What is told of the files that can ask what is installed; the others name what they go over."""
     folders = [ROOT / "tests", *ROOT.glob("splatwizard-*/tests"), *ROOT.glob("plugins/*/tests")]
     tests = [path for folder in folders for path in sorted(folder.rglob("test_*.py"))]
     asking = [str(path) for path in tests if ASKING.search(path.read_text("utf-8"))]
     assert len(asking) > 50
-    collected = run_pytest(tmp_path, "--collect-only", *asking)
-    assert "test_conformance.py::test_gaussian_codecs" in collected
-    assert [line for line in collected.splitlines() if "neighbour-" in line] == []
+    counting = {str(ROOT / each.partition("::")[0]) for each in COUNTING}
+    return run_pytest(tmp_path_factory.mktemp("beside"), *sorted({*asking, *counting}))
 
 
-def test_what_counts_all_of_ours_counts_ours_alone(tmp_path):
-    assert " passed" in run_pytest(tmp_path, *COUNTING)
+def test_no_test_is_made_for_what_is_theirs(ran):
+    collected = [line for line in ran.splitlines() if line.startswith("collected ")]
+    assert any("test_conformance.py::test_gaussian_codecs" in line for line in collected)
+    assert [line for line in collected if "neighbour-" in line] == []
+
+
+def test_what_counts_all_of_ours_counts_ours_alone(ran):
+    """`run_pytest` has asserted that none of them failed."""
+    ran_tests = int(re.search(r"(\d+) passed", ran)[1])
+    assert ran_tests >= len(COUNTING)

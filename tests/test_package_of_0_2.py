@@ -8,17 +8,19 @@ import importlib
 import json
 import math
 import shutil
-import subprocess
+import zipfile
 from pathlib import Path
 
 import pytest
-from fresh_environments import ROOT, FreshEnvironment, build_wheels
+from fresh_environments import ROOT, build_wheels
+from strangers_site import Site
 
 pytestmark = pytest.mark.pipeline
 
 PACKAGE = ROOT / "tests" / "golden" / "packages_0_2" / "sw-third-party"
 UNCHANGED = "6fe18339dd33df47"
 PROMISED = (PACKAGE.parent / "promised.txt").read_text("utf-8").split()
+PYTEST = "import sys, pytest; sys.exit(pytest.main(sys.argv[1:]))"
 SHORT = ("--set", "pretrained.iterations=40", "--set", "iterations=10")
 
 
@@ -27,17 +29,13 @@ def files_of_the_package() -> list[Path]:
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    (built,) = build_wheels([PACKAGE], tmp_path_factory.mktemp("of_0_2"))
-    return built
-
-
-@pytest.fixture(scope="module")
-def beside(tmp_path_factory: pytest.TempPathFactory, core_environment, wheels, wheel) -> FreshEnvironment:
-    """All of ours as they are now, and the package, whose metadata asks for 0.2."""
-    environment = core_environment.clone(tmp_path_factory.mktemp("beside") / "env")
-    environment.install(*(each for name, each in wheels.items() if name != "splatwizard-core"), wheel)
-    return environment
+def beside(tmp_path_factory: pytest.TempPathFactory) -> Site:
+    """The package's wheel, unpacked as pip does, beside all of ours; its metadata asks for 0.2."""
+    site = Site(tmp_path_factory.mktemp("beside"))
+    (wheel,) = build_wheels([PACKAGE], tmp_path_factory.mktemp("of_0_2"))
+    with zipfile.ZipFile(wheel) as content:
+        content.extractall(site.folder)
+    return site
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
@@ -63,31 +61,26 @@ def test_it_is_as_it_was():
 
 
 def test_it_runs_and_its_file_decodes(beside, tmp_path):
-    listed = beside.plugins()["sw-third-party"]
+    listed = beside.listed().of("sw-third-party")
     assert listed["error"] is None
     assert [each["name"] for each in listed["provides"]] == ["opacity-prune"]
-    beside.run("run", "--method", "opacity-prune", "--scene", "demo:tiny", "--out", str(tmp_path / "out"), *SHORT)
+    beside.sw("run", "--method", "opacity-prune", "--scene", "demo:tiny", "--out", str(tmp_path / "out"), *SHORT)
     (path,) = (tmp_path / "out").glob("**/metrics.json")
     record = json.loads(path.read_text())
     assert math.isfinite(record["metrics"]["psnr"]["mean"])
-    decoded = json.loads(beside.run("decode", str(path.parent / "scene.swz"), "--json").stdout)
+    decoded = json.loads(beside.sw("decode", str(path.parent / "scene.swz"), "--json").stdout)
     assert decoded["digest"] == record["file"]["digest"]
 
 
 def test_its_own_tests_pass_and_say_which_import_path_is_old(beside, tmp_path):
     shutil.copytree(PACKAGE / "tests", tmp_path / "tests")
-    done = subprocess.run(
-        [str(beside.python), "-m", "pytest", "-q", "--import-mode=importlib", "-p", "no:cacheprovider", "tests"],
-        **{**beside._surroundings({}), "cwd": tmp_path}, capture_output=True, check=False,
-    )  # fmt: skip
+    done = beside.run("-c", PYTEST, "-q", "--import-mode=importlib", "-p", "no:cacheprovider", "tests", cwd=tmp_path)
     assert done.returncode == 0, done.stdout
     assert "DeprecationWarning: sw_finetuning is sw_gaussians.finetune now" in done.stdout
 
 
 def test_pip_tells_that_its_metadata_forbids_this_release(beside):
     """As 0.2 told authors to write it; so pip installs it only with --no-deps, or before the upgrade."""
-    done = subprocess.run(
-        [str(beside.python), "-m", "pip", "check"], **beside._surroundings({}), capture_output=True, check=False
-    )
+    done = beside.run("-m", "pip", "check")
     assert "sw-third-party 0.1.0 requires sw-finetuning, which is not installed" in done.stdout
     assert "sw-third-party 0.1.0 has requirement splatwizard-core<0.3,>=0.2, but you have" in done.stdout

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 import shlex
 import subprocess
@@ -65,6 +66,7 @@ def constants_of(tree: ast.Module) -> dict[str, str]:
     }  # fmt: skip
 
 
+@functools.cache
 def collected() -> dict[str, list[str]]:
     """Command as the code has it -> the modules that print it."""
     found: dict[str, list[str]] = {}

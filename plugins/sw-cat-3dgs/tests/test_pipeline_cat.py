@@ -169,13 +169,13 @@ def test_a_model_without_a_triplane_or_without_anchors_has_a_file(method, train,
 
 def test_a_heavier_rate_makes_a_smaller_file(method, train, trained, scene, rasterizer):
     sizes, quality = [], []
-    for weight in (0.004, 0.03, 0.2):
+    for weight in (0.004, 0.2):
         model = (trained if weight == 0.004 else train(rate_term__lambda_=weight).model).eval()
         data = encoded(model, method, rate_term__lambda_=weight)
         sizes.append(len(data))
         quality.append(psnr(decoded(data), scene, rasterizer))
-    assert sizes[0] > sizes[1] > sizes[2]
-    assert quality[0] > quality[1] > quality[2]
+    assert sizes[0] > sizes[1]
+    assert quality[0] > quality[1]
 
 
 def test_a_heavy_weight_on_the_planes_shrinks_their_section(method, train):

@@ -2,13 +2,12 @@
 
 import copy
 import struct
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 import torch
 from compact_models import PLUGINS, decoded, encoded, make, method, written
+from forked_children import run_python
 from sw_compact3dgs.file import OPACITY
 from sw_compact3dgs.method import Compact3DGS
 from sw_compact3dgs.model import PLAIN, SMALLEST_SCALE
@@ -136,7 +135,7 @@ def test_another_process_decodes_the_same(tmp_path):
         "for path in sys.argv[1:]:\n"
         "    print(Compact3DGS(load_plugins(), None).decode(ContainerReader.open(path)).digest())\n"
     )
-    found = subprocess.run([sys.executable, "-c", code, *map(str, paths)], capture_output=True, text=True, check=True)
+    found = run_python("-c", code, *map(str, paths), check=True)
     assert found.stdout.split() == [decoded(path.read_bytes()).digest() for path in paths]
 
 

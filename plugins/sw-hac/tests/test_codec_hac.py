@@ -2,13 +2,12 @@
 
 import dataclasses
 import json
-import subprocess
-import sys
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from forked_children import run_python
 from hac_models import PLUGINS, decoded, encoded, generator, lattice_of, make, method, predictor
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -118,7 +117,7 @@ def test_another_process_decodes_the_same(tmp_path):
         "    print(decode_model(ContainerReader.open(path), load_plugins()).digest())\n"
         "assert 'sympy' not in sys.modules  # torch imports it for meta tensors, in half a second\n"
     )
-    found = subprocess.run([sys.executable, "-c", code, *map(str, paths)], capture_output=True, text=True, check=True)
+    found = run_python("-c", code, *map(str, paths), check=True)
     assert found.stdout.split() == [decoded(path.read_bytes()).digest() for path in paths]
 
 

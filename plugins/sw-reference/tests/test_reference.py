@@ -1,10 +1,8 @@
 """The reference rasterizer: every fact of the public checks, finite differences, and the naive loop as an oracle."""
 
-import subprocess
-import sys
-
 import pytest
 import torch
+from forked_children import run_python
 from sw_reference import compositing, plugin
 from sw_reference.projection import rotation_matrices
 from sw_reference.rasterizer import ReferenceRasterizer
@@ -231,6 +229,6 @@ checks = rasterizer_checks.checks_for(ReferenceRasterizer.info)
 checks[0](ReferenceRasterizer(), "cpu")
 print(len(checks))
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    done = run_python("-c", code)
     assert done.returncode == 0, done.stderr
     assert int(done.stdout) == len(checks_for(ReferenceRasterizer.info)) > 50

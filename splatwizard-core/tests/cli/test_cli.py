@@ -14,6 +14,7 @@ from pathlib import Path
 import click
 import pytest
 from counted_lines import lines_of_process
+from forked_children import run_python
 from sw_gaussians.start import gaussians_from_points
 
 from splatwizard_core.__main__ import start
@@ -30,10 +31,7 @@ COMMANDS = (
 
 def sw(*args: str, **env: str) -> subprocess.CompletedProcess[str]:
     """Run `sw` in a process of its own."""
-    return subprocess.run(
-        [sys.executable, "-m", "splatwizard_core", *args],
-        capture_output=True, text=True, timeout=300, env={**os.environ, **env}, check=False,
-    )  # fmt: skip
+    return run_python("-m", "splatwizard_core", *args, env={**os.environ, **env})
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["list-plugins"], ["list-plugins", "--json"], ["run", "--help"]])

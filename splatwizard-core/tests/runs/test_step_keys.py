@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 import subprocess
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 
 import pytest
 import torch
+from forked_children import start_python
 from PIL import Image
 from pydantic import Field
 
@@ -258,10 +258,8 @@ def test_a_child_ends_with_the_process_that_started_it(toy_plugins: PluginManage
         "--out",
         str(tmp_path),
     ]
-    child = subprocess.Popen(
-        [sys.executable, "-m", "splatwizard_core.cli.fresh_child", *arguments],
-        stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
-    )  # fmt: skip
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+    child = start_python("-m", "splatwizard_core.cli.fresh_child", *arguments, **pipes)
     assert child.stdin is not None
     assert child.stderr is not None
     assert any(b"training toy" in line for line in child.stderr)  # a slow machine tells of other things first

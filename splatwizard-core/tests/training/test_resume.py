@@ -20,10 +20,15 @@ from splatwizard_core.training.scheduler import STOP, Scheduler
 from splatwizard_core.training.timing import LoopClock
 
 
+@pytest.fixture(scope="module")
+def trained_once():
+    return {}
+
+
 @pytest.fixture
-def whole(toy):
+def whole(toy, trained_once):
     """200 steps in one go."""
-    outcome = toy.train(iterations=200)
+    outcome = trained_once.get("outcome") or trained_once.setdefault("outcome", toy.train(iterations=200))
     assert outcome.model.num_rows != 40  # densification did something,
     assert outcome.model.phase == "noisy"  # the mode changed,
     assert outcome.model.active_sh_degree == 1  # and so did the degree
