@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -38,13 +39,11 @@ sys.exit(pytest.main(sys.argv[1:], [Plugin()]))
 """Program that tells every test it collects and runs those alone that go over everything."""
 
 
-def run_pytest(folder: Path, *arguments: str) -> str:
-    """Run tests of this repository with the neighbours installed; return what pytest prints."""
+def run_pytest(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run tests of this repository with the neighbours installed."""
     path = os.pathsep.join([*map(str, put_neighbours(folder)), *filter(None, sys.path)])
     words = ["-q", "-p", "no:cacheprovider", "-p", "no:xdist", *arguments]
-    done = run_python("-c", COLLECTING, *words, cwd=ROOT, env={**os.environ, "PYTHONPATH": path})
-    assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-2000:]
-    return done.stdout
+    return run_python("-c", COLLECTING, *words, cwd=ROOT, env={**os.environ, "PYTHONPATH": path})
 
 
 def test_the_neighbours_are_there(tmp_path):
@@ -57,7 +56,7 @@ def test_the_neighbours_are_there(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def ran(tmp_path_factory: pytest.TempPathFactory) -> str:
+def ran(tmp_path_factory: pytest.TempPathFactory) -> subprocess.CompletedProcess[str]:
     """What is told of the files that can ask what is installed; the others name what they go over."""
     folders = [ROOT / "tests", *ROOT.glob("splatwizard-*/tests"), *ROOT.glob("plugins/*/tests")]
     tests = [path for folder in folders for path in sorted(folder.rglob("test_*.py"))]
@@ -68,12 +67,11 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 def test_no_test_is_made_for_what_is_theirs(ran):
-    collected = [line for line in ran.splitlines() if line.startswith("collected ")]
+    collected = [line for line in ran.stdout.splitlines() if line.startswith("collected ")]
     assert any("test_conformance.py::test_gaussian_codecs" in line for line in collected)
     assert [line for line in collected if "neighbour-" in line] == []
 
 
 def test_what_counts_all_of_ours_counts_ours_alone(ran):
-    """`run_pytest` has asserted that none of them failed."""
-    ran_tests = int(re.search(r"(\d+) passed", ran)[1])
-    assert ran_tests >= len(COUNTING)
+    assert ran.returncode == 0, ran.stdout[-4000:] + ran.stderr[-2000:]
+    assert int(re.search(r"(\d+) passed", ran.stdout)[1]) >= len(COUNTING)
