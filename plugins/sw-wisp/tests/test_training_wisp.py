@@ -28,6 +28,7 @@ Stage | Task                             | Plan
 ------+----------------------------------+-------------------------
 Pre   | update lr                        | range(18001)
 Pre   | begin noise                      | 1501
+Pre   | steps follow the networks        | 4000
 Pre   | fix levels                       | [6000, 9000]
 Pre   | draw positions anywhere in cells | 6001
 Pre   | place splats in cells            | 11500

@@ -51,6 +51,12 @@ class Context(Params):
         description="none: a mean and a deviation for each number and level; pyramid: networks on running means of the "
         "splats before",
     )
+    fit: int = Field(
+        600,
+        ge=0,
+        le=100_000,
+        description="updates of the networks on bits alone when noise begins, no pictures",
+    )
     rebuild: int = Field(200, ge=1, description="steps between measurements; half as many while numbers are rounded")
 
 
