@@ -41,13 +41,6 @@ def _fork_fresh_processes() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="module")
-def new_interpreters() -> Iterator[None]:
-    """Fresh processes of this module's tests start as users' do, with imports of their own."""
-    with forked_children.starting():
-        yield
-
-
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Put the long files first, each as a whole; the others keep their order."""
     first = {config.rootpath / name: place for place, name in enumerate(LONG_FIRST)}

@@ -2,9 +2,9 @@
 
     python benchmarks/coders.py [--symbols 1000000 10000000] [--repeats 5] [--only coders models positions]
 
-Coders: millions of symbols a second beside the library `constriction` used plainly on the same arrays, and the ratio
+Coders: millions of symbols per second beside the library `constriction` used plainly on the same arrays, and the ratio
 ours / plain (1.00: our chunks, checks and checksums cost nothing). Float models are decoded again by the encoder, as a
-proof: that time stands apart. Rates: bits a symbol beside the model's entropy and zstd level 19 on the same integers.
+proof: that time stands apart. Rates: bits per symbol beside the model's entropy and zstd level 19 on the same integers.
 Processor seconds of one thread; the runs of both take turns, and the median of each counts.
 """
 
@@ -48,7 +48,7 @@ def zstd_bits(symbols):
 
 def families(n, specs):
     """Name, symbols int32 [n], our model, a plain model, its per-symbol parameters (or what makes those of a part),
-    and the entropy in bits a symbol, if it is known.
+    and the entropy in bits per symbol, if it is known.
     """
     r = np.random.default_rng(0)
     mean, scale = r.normal(0, 10, n), np.exp(r.uniform(np.log(0.2), np.log(20), n))

@@ -44,7 +44,7 @@ import torch
 from scene_names import FORMS, split_scene
 from torch import Tensor
 
-from splatwizard_native import one_order_of_sums, seeded
+from splatwizard_core.base.random_states import one_order_of_sums, seeded
 
 METHODS = "3dgs,2dgs,hac,hac-plus,cat-3dgs,compact3dgs,lightgaussian"
 REPEATS = 5  # of an operation

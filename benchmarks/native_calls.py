@@ -61,7 +61,7 @@ def measure(only: str) -> dict[str, float]:
 
 
 def measure_in(checkout: Path, arguments: argparse.Namespace) -> dict[str, float]:
-    """What another process measures with the sources of a checkout."""
+    """Measurements that another process makes with the sources of a checkout."""
     sources = [*checkout.glob("splatwizard-*/src"), *checkout.glob("plugins/*/src")]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, sources))}
     command = [sys.executable, __file__, "--measure", "--threads", str(arguments.threads), "--only", arguments.only]

@@ -28,6 +28,7 @@ from scene import make_arrays, orbit_cameras
 from sw_gaussians.stage import ThreeDGSStage
 from torch.profiler import ProfilerActivity, profile
 
+from splatwizard_core.base.random_states import seeded
 from splatwizard_core.base.rng import Streams
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins.manager import load_plugins
@@ -39,7 +40,6 @@ from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.stage import StageContext
 from splatwizard_core.training.state import TrainingState
 from splatwizard_core.training.trainer import Trainer
-from splatwizard_native import seeded
 from sw_3dgs.config import ThreeDGSConfig
 
 TENSORS = ("means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats")
@@ -148,7 +148,7 @@ def measure(n: int, width: int, height: int, args: argparse.Namespace) -> None:
         for name in names:
             with setting(name):
                 least[name] = min(least[name], wall(trainers[name], args.steps, args.device))
-    print(f"{n:,} Gaussians, {width}x{height}, {100 * share:.0f} % visible in the first view, ms a step")
+    print(f"{n:,} Gaussians, {width}x{height}, {100 * share:.0f} % visible in the first view, ms per step")
     for name in names:
         print(f"  {name:14} wall {least[name]:6.3f}   {least[name] / least[names[0]]:5.2f} of {names[0]}")
     if args.device != "cuda":

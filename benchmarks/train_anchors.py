@@ -16,7 +16,7 @@ would make it wait). The profiler slows the host down: shares are those of a pro
 wait (CUDA only).
 --graphs on,off trains twice, with the decoding as CUDA graphs and without, and prints both with the loss at the end.
 --fused off,on trains twice, without and with the kernels for rows and networks of anchors, bits and lookups of planes.
-Rows at the end compare the last phase of all trainings: steps a second of all of it and of its second quarter
+Rows at the end compare the last phase of all trainings: steps per second of all of it and of its second quarter
 (settled), what the GPU works a step and which share of a settled step that is; and on a GPU the peak of their memory
 with that of HAC.
 
@@ -50,6 +50,7 @@ from step_parts import SECTION, kernel_times, longest_kernels, report
 from sw_anchors.fast import networks, replay, rows, sample_bits
 from torch.profiler import ProfilerActivity, profile, record_function
 
+from splatwizard_core.base.random_states import seeded
 from splatwizard_core.base.rng import Streams
 from splatwizard_core.gaussians.inputs import rgb_to_dc
 from splatwizard_core.gaussians.model import GaussianModel
@@ -65,7 +66,7 @@ from splatwizard_core.streams import stream
 from splatwizard_core.training.stage import StageContext
 from splatwizard_core.training.state import TrainingState
 from splatwizard_core.training.trainer import Trainer
-from splatwizard_native import seeded, work_time
+from splatwizard_native import work_time
 from sw_cat_3dgs.fast import plane_kernels, plane_sites
 
 # Attribute paths from the trainer -> the part of a step that its calls belong to; what a version lacks is left out.
@@ -103,8 +104,8 @@ class Phase:
     end: int
     seconds: float = 0.0
     steps: int = 0
-    busy: float = 0.0  # milliseconds of the GPU a step, in the window that was watched
-    settled: float = math.nan  # steps a second before that window: few graphs are captured, nothing grows any more
+    busy: float = 0.0  # milliseconds of the GPU per step, in the window that was watched
+    settled: float = math.nan  # steps per second before that window: few graphs are captured, nothing grows any more
     lines: list[str] = field(default_factory=list)
 
     @property
@@ -328,7 +329,7 @@ def anchors(
     loss = float(torch.stack(list(watch.losses)).mean())
     print(f"    all phases: {total:.1f} it/s; mean loss of the last {len(watch.losses)} steps {loss:.5f}")
     for phase in phases:
-        used = f", GPU busy {phase.busy * phase.rate / 10:.0f} % ({phase.busy:.2f} ms a step)" if cuda else ""
+        used = f", GPU busy {phase.busy * phase.rate / 10:.0f} % ({phase.busy:.2f} ms per step)" if cuda else ""
         print(f"    {phase.name:20} steps {phase.start + 1:,} to {phase.end:,}: {phase.rate:7.1f} it/s{used}")
         if phase.lines:
             print("\n".join(phase.lines), flush=True)
@@ -338,7 +339,7 @@ def anchors(
     if args.baseline_steps < 1:
         return found
     rate, drawn_there = explicit(trainer.state.model, count, args, session, scene, folder)
-    print(f"    3DGS drawing {drawn_there:,} Gaussians a view: {rate:.1f} it/s", flush=True)
+    print(f"    3DGS drawing {drawn_there:,} Gaussians per view: {rate:.1f} it/s", flush=True)
     return found
 
 

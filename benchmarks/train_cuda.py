@@ -108,7 +108,7 @@ class Watch:
         launches = sum(e.count for e in on_device) / WINDOW
         self.lines.append(
             f"  steps {record.step - 2 * WINDOW + 1:,} to {record.step:,}, {record.num_rows:,} Gaussians: "
-            f"{1e3 * self._wall:.2f} ms a step, GPU at work {busy / 1e3:.2f} ms in {launches:.0f} launches"
+            f"{1e3 * self._wall:.2f} ms per step, GPU at work {busy / 1e3:.2f} ms in {launches:.0f} launches"
         )
         for e in sorted(on_device, key=lambda e: -e.self_device_time_total)[:6]:
             self.lines.append(f"    device {e.self_device_time_total / WINDOW:7.1f} us  {_short(e.key)}")

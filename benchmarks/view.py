@@ -22,7 +22,7 @@ import torch
 from PIL import Image
 from sw_view.drawing import Drawing
 from sw_view.frames import Pace, frame_size
-from sw_view.looks import look
+from sw_view.mode_pictures import mode_picture
 from sw_view.packing import solid_means
 from sw_view.shown_cameras import Surroundings, surroundings_about, surroundings_of
 
@@ -73,7 +73,7 @@ def measure(name: str, model: SplatModel, around: Surroundings, scene: Scene, pl
     began = time.perf_counter()
     drawing = Drawing(model, scene, rasterizer, RasterOptions(background=scene.background.to(device)), device)
     cameras = circle(around, width, height, 24)
-    look(drawing, cameras[0])
+    mode_picture(drawing, cameras[0])
     first = time.perf_counter() - began
     rates = []
     for encoded in (False, True):
@@ -81,7 +81,7 @@ def measure(name: str, model: SplatModel, around: Surroundings, scene: Scene, pl
         cores = time.process_time()
         while len(seconds) < 3 or (sum(seconds) < SECONDS and len(seconds) < MOST_FRAMES):
             began = time.perf_counter()
-            pixels = look(drawing, cameras[len(seconds) % len(cameras)])
+            pixels = mode_picture(drawing, cameras[len(seconds) % len(cameras)])
             if encoded:
                 jpeg(pixels)
             seconds.append(time.perf_counter() - began)
@@ -91,7 +91,7 @@ def measure(name: str, model: SplatModel, around: Surroundings, scene: Scene, pl
     for camera in cameras:
         began = time.perf_counter()
         share = pace.of(0.0)
-        jpeg(look(drawing, camera.resized(*frame_size(width, height, share))))
+        jpeg(mode_picture(drawing, camera.resized(*frame_size(width, height, share))))
         pace.drew(share, time.perf_counter() - began)
     moving = "x".join(map(str, frame_size(width, height, share)))
     moved = time.perf_counter() - began

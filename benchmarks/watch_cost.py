@@ -11,7 +11,7 @@ beside other work too. `--looks 100` looks 25 times as often as the watch does: 
 cost of four a second is lost in the noise.
 
 Jobs: `train`, steps of 3DGS on the demo scene, by `splatwizard_core.train`; `plain`, both passes of the rasterizer
-`standard`, four frames a step; `decode`, the .swz that `--file` names. `s` is the least time of a step. `share`: part
+`standard`, four frames per step; `decode`, the .swz that `--file` names. `s` is the least time of a step. `share`: part
 of the wanted CPU time that the job had; `asleep`: part of the looks after which OpenMP's threads slept, 0 on quiet
 cores.
 """

@@ -1,12 +1,14 @@
-"""The fresh processes of `sw run`, forked from one that has imported torch: importing it is most of their time.
+"""Processes of `sw`, forked from one that has imported torch: importing it is most of their time.
 
-`sw run` decodes and evaluates in processes of their own, which do a second of work after two seconds of imports. A
-test session starts hundreds. Here a server imports torch and the core once and forks for each: the child has an own
-working directory, environment, path of imports, input and output, and nothing of the test's memory, plugins included.
-A child that asks for what only a new interpreter gives (another locale, other threads, hash seeds) gets one.
+`sw run` decodes and evaluates in processes of their own, and tests start `sw` beside packages that only another process
+has on its path: each does little work after two seconds of imports. A test session starts hundreds. Here a server
+imports torch and the core once and forks for each: the child has an own working directory, environment, path of
+imports, input and output, and nothing of the test's memory, plugins included; what it runs in fresh processes is forked
+from the same server. A child that asks for what only a new interpreter gives (another locale, other threads, hash
+seeds) gets one.
 
 Two failures stay unseen here: an import that only the server's own imports make good, and a crash while an interpreter
-ends. Tests with the fixture `new_interpreters` start what users start.
+ends. Inside `starting()` tests start what users start.
 """
 
 from __future__ import annotations
@@ -24,34 +26,55 @@ from typing import Any
 
 import splatwizard_core.runs.fresh
 
-MODULE = "splatwizard_core.cli.fresh_child"
-PLAIN = ("SW_", "SPLATWIZARD_", "PYTHONPATH", "PYTEST_", "COV_", "TMPDIR", "HOME", "XDG_", "TORCH_HOME", "COLUMNS")
+MODULES = ("splatwizard_core.cli.fresh_child", "splatwizard_core")
+PLAIN = (
+    "SW_", "SPLATWIZARD_", "PYTHONPATH", "PYTEST_", "COV_", "TEST_", "TMPDIR", "HOME", "XDG_", "TORCH_HOME", "COLUMNS",
+    "PATH", "CXX",
+)  # fmt: skip
 """Variables that mean the same to a process that reads them late; any other difference needs a new interpreter."""
 
 
-class ForkServer:
-    """The server's process, started with the first request and ended with its socket."""
+def run_python(*arguments: str, **options: Any) -> subprocess.CompletedProcess[str]:
+    """Do what `subprocess.run` does of this interpreter with the arguments `-m MODULE ...` or `-c PROGRAM ...`.
 
-    def __init__(self) -> None:
+    Forked if the session forks. What it prints is kept, as text.
+    """
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    ran: subprocess.CompletedProcess[str] = splatwizard_core.runs.fresh.subprocess.run(
+        [sys.executable, *arguments], **{"env": None, "cwd": None, **pipes, **options}
+    )
+    return ran
+
+
+class ForkServer:
+    """The server's process, started with the first request and ended with its socket.
+
+    connection      to the server that forked this process; None: this one starts a server of its own
+    """
+
+    def __init__(self, connection: socket.socket | None = None, environment: Mapping[str, str] | None = None) -> None:
         self._server: subprocess.Popen[bytes] | None = None
-        self._environment = dict(os.environ)
+        self._socket = connection
+        self._environment = dict(os.environ if environment is None else environment)
 
     def run(self, command: Sequence[str], **options: Any) -> subprocess.CompletedProcess[str]:
-        """Do what `subprocess.run` does, of the command and the options that `run_fresh` uses."""
-        environment = options["env"]
-        if list(command[:3]) != [sys.executable, "-m", MODULE] or not self._serves(environment):
+        """Do what `subprocess.run` does, of the command and the options that `run_fresh` and `run_python` use."""
+        environment = dict(os.environ) if options["env"] is None else options["env"]
+        work = _work(command)
+        if work is None or not self._serves(environment):
             return subprocess.run(command, **options)
         with contextlib.ExitStack() as open_files:
-            out, err = (open_files.enter_context(tempfile.TemporaryFile("w+")) for _ in range(2))
+            given, out, err = (open_files.enter_context(tempfile.TemporaryFile("w+")) for _ in range(3))
+            given.write(options.get("input", ""))
+            given.seek(0)
             ended, end = os.pipe()
             stderr = err.fileno() if options["stderr"] == subprocess.PIPE else 2
-            request = {
-                "arguments": command[3:],
-                "environment": environment,
-                "folder": str(options["cwd"] or os.getcwd()),
-            }
+            request = {**work, "environment": environment, "folder": str(options["cwd"] or os.getcwd())}
             try:
-                self._send(json.dumps(request).encode(), [options["stdin"], out.fileno(), stderr, end])
+                self._send(
+                    json.dumps(request).encode(),
+                    [options.get("stdin", given.fileno()), out.fileno(), stderr, end],
+                )
             finally:
                 os.close(end)
             with open(ended, "rb") as status:
@@ -67,7 +90,7 @@ class ForkServer:
         return all(name.startswith(PLAIN) for name in differing)
 
     def _send(self, request: bytes, files: list[int]) -> None:
-        if self._server is None:
+        if self._socket is None:
             self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             with theirs:
                 self._server = subprocess.Popen(
@@ -80,16 +103,24 @@ class ForkServer:
             text.write(request)
             text.flush()
             try:
-                socket.send_fds(self._socket, [b"run"], [text.fileno(), *files])
+                socket.send_fds(self._socket, [b"run"], [text.fileno(), self._socket.fileno(), *files])
             except OSError as error:
                 raise RuntimeError("the server that forks fresh processes has died") from error
 
     def close(self) -> None:
         """End the server; children that still run go on."""
-        if self._server is not None:
+        if self._server is not None and self._socket is not None:
             self._socket.close()
             self._server.wait()
-            self._server = None
+            self._server = self._socket = None
+
+
+def _work(command: Sequence[str]) -> dict[str, Any] | None:
+    """What a forked child does in place of the command, None if only a new process can."""
+    python, kind, what, *arguments = command
+    if python != sys.executable or (kind != "-c" and (kind != "-m" or what not in MODULES)):
+        return None
+    return {"program" if kind == "-c" else "module": what, "arguments": arguments}
 
 
 @contextlib.contextmanager
@@ -119,16 +150,19 @@ def starting() -> Iterator[None]:
         fresh.subprocess = before
 
 
-def _serve(connection: socket.socket) -> dict[str, Any]:
-    """Fork for each request; return its content in the child, which does it. The server itself never returns."""
+def _serve(connection: socket.socket) -> tuple[dict[str, Any], int]:
+    """Fork for each request; return in the child its content, which it does, and the descriptor to ask for more.
+
+    The server itself never returns.
+    """
     import signal
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # whoever asked is interrupted, and its child
     while True:
-        _, files, _, _ = socket.recv_fds(connection, 16, 5)
+        _, files, _, _ = socket.recv_fds(connection, 16, 6)
         if not files:
             os._exit(0)  # the session has ended
-        text, *ends = files
+        text, asking, *ends = files
         if os.fork() == 0:  # one process waits for the child and tells its status, so that the server need not
             child = os.fork()
             if child == 0:
@@ -150,11 +184,11 @@ def _serve(connection: socket.socket) -> dict[str, Any]:
         os.dup2(file, wanted)
     for file in ends:
         os.close(file)
-    return content
+    return content, asking
 
 
-def _become(content: dict[str, Any], ours: list[str]) -> None:
-    """Be the process that `python -m splatwizard_core.cli.fresh_child ARGUMENTS` would be."""
+def _become(content: dict[str, Any], asking: int, ours: list[str]) -> None:
+    """Be the process that `python -m MODULE ARGUMENTS` or `python -c PROGRAM ARGUMENTS` would be."""
     import atexit
     import runpy
     import traceback
@@ -165,14 +199,20 @@ def _become(content: dict[str, Any], ours: list[str]) -> None:
     np.random.seed()  # a new interpreter draws both seeds anew; `random` does so after each fork
     torch.seed()
     os.chdir(content["folder"])
+    again = ForkServer(socket.socket(fileno=asking), os.environ)
+    splatwizard_core.runs.fresh.subprocess = SimpleNamespace(run=again.run, PIPE=subprocess.PIPE)  # type: ignore[assignment]
     os.environ.clear()
     os.environ.update(content["environment"])
     paths = filter(None, content["environment"].get("PYTHONPATH", "").split(os.pathsep))
     sys.path[:] = list(dict.fromkeys([content["folder"], *map(os.path.abspath, paths), *ours]))
-    sys.argv[:] = [MODULE, *content["arguments"]]
+    sys.argv[:] = ["-c", *content["arguments"]]
     status = 1
     try:
-        runpy.run_module(MODULE, run_name="__main__", alter_sys=True)
+        if "module" in content:
+            runpy.run_module(content["module"], run_name="__main__", alter_sys=True)
+        else:
+            exec(compile(content["program"], "<string>", "exec"), {"__name__": "__main__"})
+        status = 0
     except SystemExit as end:
         status = end.code if isinstance(end.code, int) else int(end.code is not None)
         if isinstance(end.code, str):
@@ -196,4 +236,4 @@ if __name__ == "__main__":
     gc.freeze()  # else the children's first collections copy all its memory
     given = [os.path.abspath(path) for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
     ours = [path for path in sys.path[1:] if path not in given]  # the first is this file's folder
-    _become(_serve(socket.socket(fileno=int(sys.argv[1]))), ours)
+    _become(*_serve(socket.socket(fileno=int(sys.argv[1]))), ours)

@@ -9,15 +9,16 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import sysconfig
 import venv
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from strangers_site import EACH, Done
 
 ROOT = Path(__file__).resolve().parents[1]
 WORKSPACE = [
@@ -86,25 +87,19 @@ class FreshEnvironment:
             raise AssertionError(f"sw {' '.join(args)} exited {done.returncode}:\n{done.stdout}\n{done.stderr}")
         return done
 
-    def python_c(self, program: str, *args: str) -> None:
-        """Run a program in its interpreter, away from the source tree; AssertionError with its output if it fails."""
+    def run_each(self, commands: Iterable[Sequence[str]]) -> list[Done]:
+        """Run `sw ARGS` of each one after the other in one process there."""
+        return [Done(*each) for each in json.loads(self.python_c(EACH, given=json.dumps([*commands])))]
+
+    def python_c(self, program: str, *args: str, given: str = "") -> str:
+        """What a program prints in its interpreter, away from the source tree; AssertionError if it fails."""
         done = subprocess.run(
-            [str(self.python), "-c", program, *args], **self._surroundings({}), capture_output=True, timeout=1200
-        )
+            [str(self.python), "-c", program, *args], **self._surroundings({}), capture_output=True, timeout=1200,
+            input=given,
+        )  # fmt: skip
         if done.returncode:
             raise AssertionError(f"the program exited {done.returncode}:\n{done.stdout}\n{done.stderr}")
-
-    def start(self, *args: str, **env: str) -> subprocess.Popen[str]:
-        """Start `sw ARGS` there as a foreground process of a terminal would run: Ctrl-C (SIGINT) reaches it."""
-
-        def heed_interrupts() -> None:
-            # What a shell started in the background ignores, its children ignore too.
-            signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-        return subprocess.Popen(
-            self._command(args), **self._surroundings(env),
-            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, preexec_fn=heed_interrupts,
-        )  # fmt: skip
+        return str(done.stdout)
 
     def _command(self, args: Sequence[str]) -> list[str]:
         return [str(self.prefix / "bin" / "sw"), *args]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import textwrap
@@ -11,6 +12,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from forked_children import run_python
 
 
 @dataclass(frozen=True)
@@ -52,7 +55,7 @@ class Site:
 
     def sw(self, *arguments: object, check: bool = True, **env: str) -> subprocess.CompletedProcess[str]:
         """Run `sw ARGUMENTS`; AssertionError with its output if it fails or shows a traceback."""
-        done = self._python(["-m", "splatwizard_core", *map(str, arguments)], **env)
+        done = self.run("-m", "splatwizard_core", *map(str, arguments), **env)
         told = f"sw {' '.join(map(str, arguments))} exited {done.returncode}:\n{done.stdout}\n{done.stderr}"
         assert done.returncode == 0 or not check, told
         assert "Traceback" not in done.stderr, told
@@ -60,16 +63,31 @@ class Site:
 
     def sw_each(self, commands: Sequence[Sequence[str]]) -> list[Done]:
         """Run several commands one after the other in one process, which imports what they need once."""
-        done = self._python(["-c", EACH], json.dumps(commands))
+        done = self.run("-c", EACH, given=json.dumps(commands))
         assert done.returncode == 0, done.stderr
         return [Done(*each) for each in json.loads(done.stdout)]
 
-    def _python(self, arguments: list[str], given: str = "", **env: str) -> subprocess.CompletedProcess[str]:
+    def run(
+        self, *arguments: str, given: str = "", cwd: Path | None = None, **env: str
+    ) -> subprocess.CompletedProcess[str]:
+        """Run Python, with its path, from its folder or another one."""
+        return run_python(*arguments, cwd=cwd or self.folder, env=self._environment(env), input=given)
+
+    def _environment(self, more: Mapping[str, str]) -> dict[str, str]:
         path = os.pathsep.join([str(self.folder), *filter(None, [os.environ.get("PYTHONPATH")])])
         kept = {k: v for k, v in os.environ.items() if not k.startswith(("SW_", "_SW_"))}
-        return subprocess.run(
-            [sys.executable, *arguments], cwd=self.folder, env={**kept, "PYTHONPATH": path, **env}, input=given,
-            capture_output=True, text=True, timeout=1200, check=False,
+        return {**kept, "PYTHONPATH": path, **more}
+
+    def start(self, *arguments: str, **env: str) -> subprocess.Popen[str]:
+        """Start `sw ARGUMENTS` as a foreground process of a terminal would run: Ctrl-C (SIGINT) reaches it."""
+
+        def heed_interrupts() -> None:
+            # What a shell started in the background ignores, its children ignore too.
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+        return subprocess.Popen(
+            [sys.executable, "-m", "splatwizard_core", *arguments], cwd=self.folder, env=self._environment(env),
+            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, preexec_fn=heed_interrupts,
         )  # fmt: skip
 
     def listed(self, **env: str) -> Listed:

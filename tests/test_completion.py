@@ -70,6 +70,16 @@ def test_names_are_completed(line, incomplete, wanted, monkeypatch):
     assert offered(line, incomplete) == wanted
 
 
+def test_without_the_command_that_knows_words_none_are_offered_and_no_option_is_explained(monkeypatch, capsys):
+    plugins = load_plugins()
+    left = {name: entry for name, entry in plugins.commands._entries.items() if not entry.declared.get("completes")}
+    assert len(left) + 1 == len(plugins.commands)
+    monkeypatch.setattr(plugins.commands, "_entries", left)
+    assert offered("run --method", "3") == []
+    assert main(["run", "--iterations", "300"]) == 2
+    assert "No such option" in capsys.readouterr().err
+
+
 def test_scenes_below_the_data_folder_are_offered_by_dataset(tmp_path, monkeypatch):
     for name in ("park/tree", "park/bench", "town/square", ".hidden/x"):
         (tmp_path / name).mkdir(parents=True)

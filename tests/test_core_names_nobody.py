@@ -20,6 +20,7 @@ PLAIN_WORDS = {
     "range": "a form of a plan",
     "columns": "a word of tables",
     "opacity": "a property of a .ply",
+    "removal": "a kind of score that rasterizers sum up",
     "standard": "a word",
     "uniform": "a word",
 }

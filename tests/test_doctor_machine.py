@@ -7,12 +7,13 @@ import os
 import re
 import shlex
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
+import forked_children
 import pytest
 from advice import as_written
+from forked_children import run_python
 
 from splatwizard_native import NativeBuildError, find_compiler
 
@@ -21,10 +22,7 @@ def doctor(*arguments: str, **env: str) -> subprocess.CompletedProcess[str]:
     kept = {k: v for k, v in os.environ.items() if k not in ("SW_PLUGINS", "SPLATWIZARD_DATA", "SPLATWIZARD_NATIVE")}
     if "PYTHONPATH" in env:
         env["PYTHONPATH"] = os.pathsep.join(filter(None, (env["PYTHONPATH"], os.environ.get("PYTHONPATH"))))
-    return subprocess.run(
-        [sys.executable, "-m", "splatwizard_core", "doctor", *arguments],
-        capture_output=True, text=True, timeout=1200, env={**kept, **env}, check=False,
-    )  # fmt: skip
+    return run_python("-m", "splatwizard_core", "doctor", *arguments, env={**kept, **env})
 
 
 def checks_of(done: subprocess.CompletedProcess[str]) -> dict[str, dict[str, Any]]:
@@ -144,10 +142,17 @@ def test_checks_of_strangers_stand_beside_ours_and_harm_none(faulty):
     assert (checks["liar"]["group"], checks["liar"]["needed"]) == ("checks", False)
 
 
-def test_without_a_torch_that_imports_the_main_job_cannot_run(tmp_path):
+@pytest.fixture
+def without_torch(tmp_path):
+    """A folder for PYTHONPATH whose torch cannot be imported, and processes that are new: others have torch."""
     (tmp_path / "torch").mkdir()
     (tmp_path / "torch" / "__init__.py").write_text("raise ImportError('libtorch.so: cannot open shared object file')")
-    done = doctor(PYTHONPATH=str(tmp_path))
+    with forked_children.starting():
+        yield str(tmp_path)
+
+
+def test_without_a_torch_that_imports_the_main_job_cannot_run(without_torch):
+    done = doctor(PYTHONPATH=without_torch)
     assert done.returncode == 1
     assert "cannot run here" in done.stdout
     assert "libtorch.so" in done.stdout
@@ -162,10 +167,8 @@ def test_without_the_method_the_main_job_cannot_run():
     assert (job["state"], job["detail"], job["mend"]) == ("broken", "not installed: a method", "unset SW_PLUGINS")
 
 
-def test_without_torch_a_registered_check_that_needs_it_is_left_out(tmp_path):
-    (tmp_path / "torch").mkdir()
-    (tmp_path / "torch" / "__init__.py").write_text("raise ImportError('libtorch.so: cannot open shared object file')")
-    checks = checks_of(doctor("--json", PYTHONPATH=str(tmp_path)))
+def test_without_torch_a_registered_check_that_needs_it_is_left_out(without_torch):
+    checks = checks_of(doctor("--json", PYTHONPATH=without_torch))
     assert checks["torch"]["state"] == "broken"
     assert not any(check["group"] == "metrics" for check in checks.values())
 

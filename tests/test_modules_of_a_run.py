@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from forked_children import run_python
 
 GOLDEN = Path(__file__).parent / "golden"
 pytestmark = pytest.mark.pipeline
 
 STUB = """#!/bin/sh
 for word in "$@"; do case "$word" in --version|-dumpversion|-dumpmachine) echo "stub 14.0"; exit 0;; esac; done
-echo "$@" >> "$ASKED_FOR"
+echo "$@" >> "$TEST_ASKED_FOR"
 echo "this compiler only counts" >&2
 exit 1
 """
@@ -30,9 +29,8 @@ def compiled_by(tmp_path: Path, *words: str) -> set[str]:
     compiler.write_text(STUB)
     compiler.chmod(0o755)
     asked_for.touch()
-    beside = {"CXX": str(compiler), "ASKED_FOR": str(asked_for), "SPLATWIZARD_CACHE": str(tmp_path / "cache")}
-    command = [sys.executable, "-m", "splatwizard_core", *words]
-    done = subprocess.run(command, env={**os.environ, **beside}, capture_output=True, text=True)
+    beside = {"CXX": str(compiler), "TEST_ASKED_FOR": str(asked_for), "SPLATWIZARD_CACHE": str(tmp_path / "cache")}
+    done = run_python("-m", "splatwizard_core", *words, env={**os.environ, **beside})
     assert done.returncode == 0, done.stderr[-2000:]
     return set(re.findall(r"/src/(\w+)/\S+\.cpp", asked_for.read_text()))
 

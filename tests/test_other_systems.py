@@ -48,7 +48,8 @@ for module, name in {sorted(NAMES)}:
 for name in {modules}:
     importlib.import_module(name)
 from splatwizard_core.cli.main import main
-from splatwizard_native import InterruptGuard, available_cores
+from splatwizard_core.base.interrupt import InterruptGuard
+from splatwizard_native import available_cores
 assert available_cores() >= 1
 with InterruptGuard() as guard, guard.interruptible():
     pass

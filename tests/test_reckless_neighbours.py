@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import forked_children
 import pytest
 from bad_neighbours import metric
 from reckless_neighbours import (
@@ -37,12 +38,13 @@ def lines_about(name: str, text: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def listing(tmp_path_factory: pytest.TempPathFactory):
-    """`sw list-plugins --json` beside all that register recklessly."""
+    """`sw list-plugins --json` beside all that register recklessly, which imports no torch."""
     site = Site(tmp_path_factory.mktemp("street"))
     for name, (source, _) in {**IMPORTS, **BROKEN}.items():
         good = metric(f"of-{name}", name.replace("-", "_")) if name in IMPORTS else ""
         site.install(name, f"{source}\n{good}")
-    done = site.sw("list-plugins", "--json")
+    with forked_children.starting():
+        done = site.sw("list-plugins", "--json")
     return done, Listed(json.loads(done.stdout))
 
 

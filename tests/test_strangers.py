@@ -11,11 +11,13 @@ import json
 import math
 import signal
 import time
+import zipfile
 from pathlib import Path
 from typing import Any
 
 import pytest
-from fresh_environments import ROOT, FreshEnvironment, build_wheels
+from fresh_environments import ROOT, build_wheels
+from strangers_site import Site
 
 pytestmark = pytest.mark.pipeline
 
@@ -30,7 +32,7 @@ SHORT = {
     # The opacity that keeps an anchor is raised, or none of them would have gone after so few steps.
     "test-anchors": ("iterations=50", "min_opacity=0.99", "log_every=1"),
 }
-STEPS = 150
+STEPS = 60
 INTERRUPTED = {
     "test-distill": (1, ("base_iterations=10", f"iterations={STEPS}", "log_every=1")),
     "test-anchors": (0, (f"iterations={STEPS}", "adjust_interval=10", "grad_threshold=5e-3", "log_every=1")),
@@ -56,19 +58,14 @@ def run_started(training):
 
 
 @pytest.fixture(scope="module")
-def strangers(tmp_path_factory: pytest.TempPathFactory, core_environment, wheels) -> FreshEnvironment:
-    """An environment with our wheels and the three foreign ones."""
-    root = tmp_path_factory.mktemp("strangers")
-    environment = core_environment.clone(root / "env")
-    ours = (wheel for name, wheel in wheels.items() if name != "splatwizard-core")
-    environment.install(*ours, *build_wheels(list(PACKAGES.values()), root))
-    (site,) = environment.prefix.glob("lib/python*/site-packages")
-    (site / "sw_brake.py").write_text(BRAKE)
-    info = site / "sw_brake-0.1.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: sw-brake\nVersion: 0.1\n")
-    (info / "entry_points.txt").write_text("[splatwizard]\nbrake = sw_brake\n")
-    return environment
+def strangers(tmp_path_factory: pytest.TempPathFactory) -> Site:
+    """The three foreign wheels, unpacked as pip does, and the brake."""
+    site = Site(tmp_path_factory.mktemp("strangers"))
+    for wheel in build_wheels(list(PACKAGES.values()), tmp_path_factory.mktemp("wheels")):
+        with zipfile.ZipFile(wheel) as content:
+            content.extractall(site.folder)
+    site.install("sw-brake", BRAKE)
+    return site
 
 
 def arguments(method: str, out: Path, sets: tuple[str, ...]) -> list[str]:
@@ -88,16 +85,16 @@ def log_of(out: Path) -> list[dict[str, Any]]:
 
 
 def test_they_are_listed_with_their_distribution(strangers):
-    plugins = strangers.plugins()
+    plugins = strangers.listed()
     for method, project in PACKAGES.items():
-        listed = plugins[project.name]
+        listed = plugins.of(project.name)
         assert listed["error"] is None
         assert [e["name"] for e in listed["provides"] if e["kind"] == "method"] == [method]
 
 
 @pytest.mark.parametrize("method", PACKAGES)
 def test_it_runs_by_name_and_its_file_decodes_in_a_fresh_process(strangers, tmp_path, method):
-    strangers.run("run", *arguments(method, tmp_path / "out", SHORT[method]))
+    strangers.sw("run", *arguments(method, tmp_path / "out", SHORT[method]))
     record = record_of(tmp_path / "out")
     assert record["method"] == method
     (path,) = (tmp_path / "out").glob("**/scene.swz")
@@ -107,7 +104,7 @@ def test_it_runs_by_name_and_its_file_decodes_in_a_fresh_process(strangers, tmp_
     lonely = tmp_path / "lonely"
     lonely.mkdir()
     (lonely / "copy.swz").write_bytes(path.read_bytes())
-    decoded = json.loads(strangers.run("decode", str(lonely / "copy.swz"), "--json").stdout)
+    decoded = json.loads(strangers.sw("decode", str(lonely / "copy.swz"), "--json").stdout)
     assert decoded["digest"] == record["file"]["digest"]
     if method == "test-anchors":
         rows = [line["num_anchors"] for line in log_of(tmp_path / "out") if "num_anchors" in line]
@@ -118,7 +115,7 @@ def test_it_runs_by_name_and_its_file_decodes_in_a_fresh_process(strangers, tmp_
 def test_an_interrupted_training_goes_on_and_ends_as_an_uninterrupted_one(strangers, tmp_path, method):
     stage, sets = INTERRUPTED[method]
     whole, broken = tmp_path / "whole", tmp_path / "broken"
-    strangers.run("train", *arguments(method, whole, sets))
+    strangers.sw("train", *arguments(method, whole, sets))
     with strangers.start("train", *arguments(method, broken, sets), TEST_BRAKE="1") as process:
         while process.poll() is None and not any(x["stage"] == stage and x["step"] > 20 for x in log_of(broken)):
             time.sleep(0.01)
@@ -128,17 +125,17 @@ def test_an_interrupted_training_goes_on_and_ends_as_an_uninterrupted_one(strang
     last = log_of(broken)[-1]
     assert (last["stage"], last["step"] < STEPS) == (stage, True)
     assert list(broken.glob(f"**/checkpoints/{stage:02}-{last['step']:07}.safetensors"))
-    strangers.run("train", *arguments(method, broken, sets))
+    strangers.sw("train", *arguments(method, broken, sets))
     assert log_of(broken)[-1]["step"] == STEPS
     files = []
     for out in (whole, broken):
         (directory,) = (path.parent for path in out.glob("**/config.toml"))
-        strangers.run("encode", str(directory))
+        strangers.sw("encode", str(directory))
         files.append((directory / "scene.swz").read_bytes())
     assert files[0] == files[1]
 
 
 def test_the_plan_of_a_stranger_is_printed_stage_by_stage(strangers):
-    text = strangers.run("schedule", "opacity-prune").stdout
+    text = strangers.sw("schedule", "opacity-prune").stdout
     assert "starts from a trained 3dgs scene" in text
     assert "prune by opacity" in text

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from strangers_site import Site
 
 from splatwizard_core.coding.container import ContainerReader
 
@@ -64,19 +62,9 @@ RUN = [
 @pytest.fixture(scope="module")
 def sw(tmp_path_factory: pytest.TempPathFactory):
     """sw(*arguments): a finished process of `sw` where the distribution sw-theirs is installed."""
-    root = tmp_path_factory.mktemp("theirs")
-    (root / "sw_theirs.py").write_text(THEIRS)
-    information = root / "sw_theirs-1.0.dist-info"
-    information.mkdir()
-    (information / "METADATA").write_text("Metadata-Version: 2.1\nName: sw-theirs\nVersion: 1.0\n")
-    (information / "entry_points.txt").write_text("[splatwizard]\ntheirs = sw_theirs\n")
-    path = os.pathsep.join([str(root), *filter(None, [os.environ.get("PYTHONPATH")])])
-
-    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "splatwizard_core", *arguments]
-        return subprocess.run(command, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path})
-
-    return run
+    site = Site(tmp_path_factory.mktemp("theirs"))
+    site.install("sw-theirs", THEIRS)
+    return lambda *arguments: site.sw(*arguments, check=False)
 
 
 def test_their_settings_are_parsed_recorded_and_reach_their_codec(sw, tmp_path: Path):

@@ -1,7 +1,8 @@
-"""docs/tutorial.md, pasted line by line into a fresh environment: from `sw new-plugin` to a wheel.
+"""docs/tutorial.md, line by line: from `sw new-plugin` to a wheel.
 
-Nothing is changed but that trainings are short and of the small demo scene, and that installing takes what is there
-instead of asking a network.
+Nothing is changed but that trainings are short and of the small demo scene, and that pip, in an environment of its own,
+takes what is there instead of asking a network. Everything else runs in processes that have what pip installed on
+their path, beside this workspace.
 """
 
 from __future__ import annotations
@@ -14,19 +15,19 @@ from pathlib import Path
 
 import pytest
 from fresh_environments import ROOT, FreshEnvironment, make_environment
+from strangers_site import Site
 
 PAGE = ROOT / "docs" / "tutorial.md"
 SHORT = ["--set", "iterations=20"]
 STARTED = ["--set", "pretrained.iterations=20"]
 OFFLINE = ["--no-deps", "--no-index", "--no-build-isolation", "--disable-pip-version-check", "-q"]
+PYTEST = "import sys, pytest; sys.exit(pytest.main(sys.argv[1:]))"
 STEP = re.compile(r"((?:^    [^\n]+\n)+)|^```python\n# (file|replace in): (\S+)\n(.*?)^```$", re.M | re.S)
 
 
 @pytest.fixture(scope="module")
-def environment(tmp_path_factory: pytest.TempPathFactory, wheels: dict[str, Path]) -> FreshEnvironment:
-    made = make_environment(tmp_path_factory.mktemp("tutorial") / "env")
-    made.install(*wheels.values())
-    return made
+def environment(tmp_path_factory: pytest.TempPathFactory) -> FreshEnvironment:
+    return make_environment(tmp_path_factory.mktemp("tutorial") / "env")
 
 
 class Reader:
@@ -34,30 +35,49 @@ class Reader:
 
     def __init__(self, environment: FreshEnvironment, folder: Path) -> None:
         self.environment, self.folder = environment, folder
+        self.site = Site(folder / "site")
+        self.site.folder.mkdir()
         self.done: list[str] = []
 
     def paste(self, line: str) -> None:
         """Run a line of a shell."""
         self.done.append(line)
         program, *words = shlex.split(line)
-        python = str(self.environment.python)
         if program == "cd":
             self.folder /= words[0]
             return
         if program == "sw" and words[0] == "run":
             words = [word if word != "demo" else "demo:tiny" for word in words]
             words += SHORT if "3dgs" in words else [*SHORT, *STARTED]
-        command = {
-            "sw": [str(self.environment.prefix / "bin" / "sw"), *words],
-            "pytest": [python, "-m", "pytest", "-p", "no:cacheprovider", *words],
-            "ruff": [sys.executable, "-m", "ruff", *words, "--no-cache"],
-            "pip": [python, "-m", "pip", *words, *OFFLINE],
-        }[program]
-        surroundings = {**self.environment._surroundings({}), "cwd": self.folder}
-        done = subprocess.run(command, **surroundings, capture_output=True, timeout=1200, check=False)
+        done = getattr(self, program)(*words)
         assert done.returncode == 0, (
             f"`{line}` ended with {done.returncode}:\n{done.stdout[-2500:]}{done.stderr[-800:]}"
         )
+
+    def sw(self, *words: str) -> subprocess.CompletedProcess[str]:
+        return self.site.run("-m", "splatwizard_core", *words, cwd=self.folder)
+
+    def pytest(self, *words: str) -> subprocess.CompletedProcess[str]:
+        return self.site.run("-c", PYTEST, "-p", "no:cacheprovider", "--import-mode=importlib", *words, cwd=self.folder)
+
+    def ruff(self, *words: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "ruff", *words, "--no-cache"]
+        return subprocess.run(command, cwd=self.folder, capture_output=True, text=True, check=False)
+
+    def pip(self, *words: str) -> subprocess.CompletedProcess[str]:
+        """What it installs is put on the path: metadata, and the folders that a .pth names."""
+        command = [str(self.environment.python), "-m", "pip", *words, *OFFLINE]
+        surroundings = {**self.environment._surroundings({}), "cwd": self.folder}
+        done = subprocess.run(command, **surroundings, capture_output=True, timeout=1200, check=False)
+        (installed,) = self.environment.prefix.glob("lib/python*/site-packages")
+        for information in installed.glob("sw_area_prune-*.dist-info"):
+            place = self.site.folder / information.name
+            place.exists() or place.symlink_to(information)
+        for named in installed.glob("*area_prune*.pth"):
+            for module in Path(named.read_text().strip()).iterdir():
+                place = self.site.folder / module.name
+                place.exists() or place.symlink_to(module)
+        return done
 
     def save(self, path: str, text: str) -> None:
         """Write a file of the package, which has one already."""

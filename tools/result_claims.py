@@ -1,8 +1,8 @@
 """Claims of papers whose data sets are not at hand, beside what small scenes of the same kind give: `table claims all`.
 
-Ratio and difference are to the exact 3DGS of the same seed and matrix of runs: its float32 .ply (248 bytes a Gaussian)
-over the file, and PSNR less its PSNR. Runs whose matrix has no such record are left out; where none has one, all are
-compared with the mean of every exact 3DGS of the scene, and the cell is marked.
+Ratio and difference are to the exact 3DGS of the same seed and matrix of runs: its float32 .ply (248 bytes
+per Gaussian) over the file, and PSNR less its PSNR. Runs whose matrix has no such record are left out; where none
+has one, all are compared with the mean of every exact 3DGS of the scene, and the cell is marked.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from pathlib import Path
 from result_groups import Rows, points, title
 from result_records import RECORDS, ROOT, SmallRecord, read
 from sw_report.figures import Line, Panel, write_panels
-from sw_report.looks import looks_of_methods
+from sw_report.method_styles import styles_of_methods
 
 IMAGES = ROOT / "docs" / "images"
 METRICS = {"psnr": "PSNR, dB", "ssim": "SSIM"}
@@ -41,7 +41,7 @@ def shown(scene: str, records_at: Path = RECORDS) -> str:
 def panels(records: Rows) -> list[Panel]:
     """Return the curves: a line for each method and variant, a point for each of its rates."""
     groups = points(records)
-    looks = looks_of_methods({title(group): group[0].method for group in groups})
+    styles = styles_of_methods({title(group): group[0].method for group in groups})
     found = []
     for metric, label in METRICS.items():
         lines: dict[str, Line] = {}
@@ -49,7 +49,7 @@ def panels(records: Rows) -> list[Panel]:
             point = _point(group, metric)
             if point is not None:
                 name = title(group)
-                line = lines.setdefault(name, Line(name, [], looks[name], any(r.anchors for r in group)))
+                line = lines.setdefault(name, Line(name, [], styles[name], any(r.anchors for r in group)))
                 line.points.append(point)
         for line in lines.values():
             line.points.sort()
@@ -60,7 +60,7 @@ def panels(records: Rows) -> list[Panel]:
 def digest(scene: str, records_at: Path = RECORDS) -> str:
     """Return what stands for the points of a figure."""
     told = [
-        [panel.label, [[line.name, line.look, line.dashed, line.points] for line in panel.lines]]
+        [panel.label, [[line.name, line.style, line.dashed, line.points] for line in panel.lines]]
         for panel in panels(_records(scene, records_at))
     ]
     return "points " + hashlib.sha256(json.dumps(told).encode()).hexdigest()[:16]

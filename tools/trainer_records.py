@@ -20,7 +20,7 @@ class Training:
     trainer         "splatwizard", or another's name and version
     scene, plan     folder's name (FAMILY:name where that was asked for) and picture folder; "3dgs" (default density
                     control) or "mcmc"
-    per_second      steps a second of the loop; None where other work was on the GPU
+    per_second      steps per second of the loop; None where other work was on the GPU
     gaussians       at the end; None: not counted
     peak_mib        peak of torch's allocator in the loop; None: not measured
     note            SSIM of the loss, who resets opacities

@@ -10,6 +10,7 @@ from sw_gaussians.start import gaussians_from_points, surfels_from_points
 from sw_gaussians.surfels import Surface, SurfelModel
 
 from splatwizard_core.api import ParamGroup, SplatOptimizer
+from splatwizard_core.base.random_states import seeded
 from splatwizard_core.errors import ConfigError, SceneError
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
@@ -19,7 +20,6 @@ from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
 from splatwizard_core.streams import stream
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.scheduler import build_schedulers, format_plan
-from splatwizard_native import seeded
 from sw_2dgs.config import TwoDGSConfig
 from sw_2dgs.datasets import surface_of
 from sw_2dgs.method import TwoDGS

@@ -12,6 +12,7 @@ from sw_gaussians.stage import ThreeDGSStage
 from sw_gaussians.start import gaussians_from_points
 from sw_gaussians.statistics import accumulate_in_torch, accumulate_statistics
 
+from splatwizard_core.base.random_states import seeded
 from splatwizard_core.base.rng import Streams
 from splatwizard_core.plugins.manager import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
@@ -23,7 +24,6 @@ from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.stage import StageContext
 from splatwizard_core.training.state import TrainingState
 from splatwizard_core.training.trainer import CHECK_EVERY, Trainer
-from splatwizard_native import seeded
 from splatwizard_native.fused.native import TRAINING
 from sw_3dgs.config import ThreeDGSConfig
 

@@ -12,7 +12,7 @@ from sw_anchors.fast.rows import take_rows
 from sw_anchors.native import ANCHORS
 from sw_anchors.noisy_values import Noise, noisy_values
 
-from splatwizard_native import seeded
+from splatwizard_core.base.random_states import seeded
 from sw_codecs.context.two_layers import two_layers
 
 needs_kernels = pytest.mark.skipif(ANCHORS.available() is not None, reason=str(ANCHORS.available()))

@@ -10,7 +10,7 @@ from sw_anchors.coded_anchors import ENTROPY, FULL, QUANTIZED, CodedAnchors
 from sw_anchors.decoded_anchors import DecodedAnchors
 from sw_anchors.growth import adjust_anchors
 from sw_anchors.lattice import TOP, bounds_of, coded_positions, position_codes
-from sw_anchors.rate_model import AnchorContext, AnchorForecast, gaussian_rate
+from sw_anchors.rate_model import AnchorDistributions, AnchorForecast, gaussian_rate
 from sw_reference.rasterizer import ReferenceRasterizer
 from sw_reference.testing.raster_scenes import front_camera
 
@@ -133,8 +133,10 @@ def test_each_phase_moves_values_by_its_own_step():
             assert ("rate" in a.extras) == (phase == ENTROPY and training)
 
 
-def test_noise_of_the_second_phase_has_its_own_factor():
-    model, rows = make(n=400, noise_factor=1.1), torch.arange(400)
+def test_noise_of_the_second_phase_has_steps_of_its_own(monkeypatch):
+    model, rows = make(n=400), torch.arange(400)
+    steps = model.noise_steps(model.features)
+    monkeypatch.setattr(model, "noise_steps", lambda like: 1.1 * steps)
     model.phase = QUANTIZED
     moved = (model.attributes(rows).features - model.features).detach().abs().max()
     assert 0.5 < float(moved) <= 0.55
@@ -216,7 +218,7 @@ class Older(Flat):
     def predict(self, rows):
         widths, n = self.shape.widths, len(rows)
         steps = self.log_steps.exp()
-        return AnchorContext(
+        return AnchorDistributions(
             tuple(torch.zeros(n, w) for w in widths),
             tuple(torch.ones(n, w) for w in widths),
             tuple(step.expand(n, 1) for step in steps),

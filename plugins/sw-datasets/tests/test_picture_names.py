@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import unicodedata
@@ -24,6 +25,15 @@ def folder(tmp_path):
         return tmp_path
 
     return write
+
+
+def test_a_folder_that_cannot_be_read_is_not_called_empty(folder, monkeypatch):
+    def refuse(path):
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr(os, "scandir", refuse)
+    with pytest.raises(SceneError, match="cannot be read: Permission denied"):
+        find_pictures(folder("b.png"), ["a.png"])
 
 
 @pytest.mark.parametrize("there", ["NFC", "NFD"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from doctored import distribution
 from sw_doctor import diagnosis, packages
-from sw_doctor.cures import cure_of
+from sw_doctor.remedies import remedy_of
 
 
 def test_requirements_and_extras_come_from_the_metadata(site):
@@ -114,7 +114,7 @@ def test_what_only_a_stranger_needs_decides_nothing_about_the_main_job(site):
 )  # fmt: skip
 def test_the_cure_of_a_plugin_is_what_helps_against_its_reason(site, why, foreign, mend):
     distribution(site, "sw-thing", sw_thing="")
-    assert cure_of("sw-thing", why, foreign=foreign) == mend
+    assert remedy_of("sw-thing", why, foreign=foreign) == mend
 
 
 def test_a_distribution_in_two_places_is_told_with_both(site, tmp_path, monkeypatch):

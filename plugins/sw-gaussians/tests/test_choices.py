@@ -6,6 +6,7 @@ from typing import ClassVar, Literal
 import pytest
 from pydantic import Field
 from sw_gaussians.choices import Choice, Choosing, CodecChoice, Moved, OwnCodec, PrunerChoice
+from sw_gaussians.named_blocks import SWITCH
 
 from splatwizard_core.errors import ConfigError, PluginError
 from splatwizard_core.plugins.registry import Coders, Registry
@@ -228,6 +229,16 @@ def test_older_keys_mean_what_they_meant(config):
 def test_an_older_setting_of_another_provider_is_left_out_as_it_was(config):
     assert config({"prune.pruner": "theirs", "prune.exponent": "3"}).prune.settings == {}
     assert config({"prune.pruner": "theirs"}, {"prune.exponent": "3"}).prune.settings == {}
+
+
+@pytest.mark.parametrize("value", ["true", False, "off", "0"])
+def test_a_switch_between_two_ways_to_one_result_is_gone_quietly(value):
+    assert Moved((), SWITCH).checked("graphs", value) == value
+
+
+def test_nonsense_for_a_switch_that_is_gone_is_refused():
+    with pytest.raises(ConfigError, match=r"'graphs' is gone since 0\.3, with what maybe did: leave it out"):
+        Moved((), SWITCH).checked("graphs", "maybe")
 
 
 def test_an_older_key_that_never_was_is_unknown(config):

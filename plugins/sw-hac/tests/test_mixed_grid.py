@@ -3,8 +3,8 @@
 import pytest
 import torch
 
+from splatwizard_core.base.random_states import seeded
 from splatwizard_core.plugins import load_plugins
-from splatwizard_native import seeded
 from sw_codecs.exact_native import EXACT
 from sw_codecs.native import CODECS
 from sw_codecs.testing import check_context_model

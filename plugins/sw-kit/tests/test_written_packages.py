@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from forked_children import run_python
 
 _spec = importlib.util.spec_from_file_location("kit_packages", Path(__file__).parent / "kit_packages.py")
 assert _spec is not None
@@ -17,15 +16,16 @@ packages = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(packages)
 
 
+PYTEST = "import sys, pytest; sys.exit(pytest.main(sys.argv[1:]))"
+
+
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
     return packages.one_of_each(tmp_path_factory.mktemp("written"))
 
 
 def run(written, *command, cwd):
-    return subprocess.run(
-        [sys.executable, *command], cwd=cwd, env=packages.environment(written.values()), capture_output=True, text=True
-    )
+    return run_python(*command, cwd=cwd, env=packages.environment(written.values()))
 
 
 def check(written, kinds, cwd, *options):
@@ -40,7 +40,7 @@ def check(written, kinds, cwd, *options):
 def test_the_tests_of_every_kind_pass(written, tmp_path):
     tests = [str(package / "tests") for package in written.values()]
     done = run(
-        written, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--import-mode=importlib", f"--rootdir={tmp_path}",
+        written, "-c", PYTEST, "-q", "-p", "no:cacheprovider", "--import-mode=importlib", f"--rootdir={tmp_path}",
         *tests, cwd=tmp_path,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout[-3000:]

@@ -18,7 +18,7 @@ from splatwizard_core.api import (
     RasterOptions,
     ScoreSpec,
 )
-from splatwizard_native import seeded
+from splatwizard_core.base.random_states import seeded
 from sw_rasterizers import plugin
 from sw_rasterizers.native import unavailable_on_cuda
 from sw_rasterizers.scoring import KINDS

@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 import pytest
 from sw_report.charts import STYLES
 from sw_report.figures import Line, Panel, write_figures, write_panels
-from sw_report.looks import look_of
+from sw_report.method_styles import style_of_method
 from sw_report.rd_file import themes
 from sw_report.runs import collect
 
@@ -40,7 +40,7 @@ def test_scenes_and_data_sets_are_svg_and_pdf_with_the_colours_of_the_page(runs,
         text = file.read_text()
         assert "".join(ElementTree.fromstring(text).itertext()).count("toy_$x") == 1  # the legend, not mathematics
         for method in ("toy_$x", "3dgs"):
-            assert themes()[0][f"--s{look_of(method) % STYLES}"] in text
+            assert themes()[0][f"--s{style_of_method(method) % STYLES}"] in text
         assert "PSNR dB" in text
     garden = [run for run in runs if run.facts.scene == "garden"]
     for again in write_figures(garden, tmp_path / "again"):  # equal runs make equal files

@@ -6,7 +6,7 @@ import shlex
 from sw_report import numbers
 from sw_report.aggregate import dataset_tables
 from sw_report.commands import command_of, commands_table
-from sw_report.looks import looks_of
+from sw_report.method_styles import styles_of
 from sw_report.plots import mean_charts, section_bars
 from sw_report.results_tables import config_table, cost_table, runs_table
 from sw_report.runs import collect
@@ -137,7 +137,7 @@ def test_means_over_scenes_are_drawn_as_curves(make_curve, make_run, tmp_path):
     make_curve("lacking", scene="a")
     runs = collect([tmp_path]).runs
     (table,) = dataset_tables(runs)
-    charts = mean_charts(table, runs, looks_of(runs))
+    charts = mean_charts(table, runs, styles_of(runs))
     assert [figure.caption for figure in charts.figures] == ["PSNR, dB", "SSIM"]
     assert [name for _, name in charts.legend] == ["3dgs", "toy"]  # no mean, no curve
     told = re.findall(r"<title>(toy r1: [^<]*)</title>", charts.figures[0].svg)
@@ -150,4 +150,4 @@ def test_means_without_a_curve_are_not_drawn(make_run, tmp_path):
     for scene in ("a", "b"):
         make_run(scene=scene)
     runs = collect([tmp_path]).runs
-    assert mean_charts(dataset_tables(runs)[0], runs, looks_of(runs)) is None
+    assert mean_charts(dataset_tables(runs)[0], runs, styles_of(runs)) is None

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from sw_report.beside_tables import beside_tables, deltas
 from sw_report.compare import compare
 from sw_report.equal_psnr import CurvePoint, at_equal, overlap
 from sw_report.published import beside, differences, steps_of
 from sw_report.published_files import Figure, published_by, read_figures, read_published
+from sw_report.published_tables import deltas, published_tables
 from sw_report.runs import collect
 
 from splatwizard_core.api import UserInputError
@@ -96,9 +96,9 @@ def test_another_rate_point_stands_beside_all_of_the_method(runs):
 
 def test_means_are_compared_once_every_scene_is_there(runs, tmp_path):
     scenes = ("bicycle", "flowers", "garden", "stump", "treehill", "room", "counter", "kitchen", "bonsai")
-    some = beside_tables(written(tmp_path / "some", scenes[:8]))
+    some = published_tables(written(tmp_path / "some", scenes[:8]))
     assert not any(table.title.startswith("mean") for table in some)
-    mean = beside_tables(written(tmp_path / "all", scenes))[-1]
+    mean = published_tables(written(tmp_path / "all", scenes))[-1]
     assert mean.title == "mean over Mip-NeRF 360, 9 scenes"
     ((_, (found,)),) = mean.groups
     assert found.figure.bytes == 16_005_406
@@ -120,14 +120,14 @@ def test_the_command_prints_both_and_names_scenes_without_figures(runs, tmp_path
     assert content["tables"][0]["others"] == []
     assert content["tables"][0]["runs"][0]["published"][0]["year"] == 2024
     with pytest.raises(UserInputError, match=r"nothing is published for demo/demo: .*mipnerf360"):
-        beside_tables(written(tmp_path / "demo", ("demo",), dataset="demo"))
+        published_tables(written(tmp_path / "demo", ("demo",), dataset="demo"))
 
 
 def test_bytes_at_equal_psnr_are_those_of_the_rate_points_around(tmp_path):
     sizes = {"r1": (31.275, 4_937_215), "r5": (33.275, 19_748_859)}  # 1.1 of half and of twice the published bytes
     for rate, (psnr, size) in sizes.items():
         written(tmp_path / "out", rate=rate, file={"bytes": size}, metrics={"psnr": {"mean": psnr}})
-    (table,) = beside_tables(collect([tmp_path / "out"]).runs, others=False)
+    (table,) = published_tables(collect([tmp_path / "out"]).runs, others=False)
     low = table.groups[0][0]
     found = at_equal(low.curve, 32.275, 8_976_754)
     assert found.ratio == pytest.approx(1.1)  # half way in dB, and in the logarithm of bytes
@@ -138,7 +138,7 @@ def test_bytes_at_equal_psnr_are_those_of_the_rate_points_around(tmp_path):
 
 def test_one_rate_point_makes_no_curve_and_that_is_said(runs):
     (run,) = runs()
-    (table,) = beside_tables([run], others=False)
+    (table,) = published_tables([run], others=False)
     assert any("no bytes at equal PSNR: 1 rate point measured here" in note for note in table.drawn().notes)
 
 

@@ -7,6 +7,8 @@ import pytest
 from sw_report.runs import collect
 from sw_report.sweeps import FILE_NAME, sweep_notes
 
+from splatwizard_core.errors import UserInputError
+
 
 def write_index(folder, rows, *, schema="1"):
     with closing(sqlite3.connect(folder / FILE_NAME)) as file, file:
@@ -34,6 +36,14 @@ def test_failures_and_what_is_missing_are_told(make_run, tmp_path):
         f"1 runs in {out} are not of the plan of its sweep",
     ]
     assert collect([out / "seed-0"]).notes == []
+
+
+def test_a_sweep_without_a_finished_run_goes_on_with_sw_bench(tmp_path):
+    with pytest.raises(UserInputError, match=r"`sw run --out .*` makes them"):
+        collect([tmp_path])
+    write_index(tmp_path, [("toy", "x", 0, "r1", "x", "waiting", "")])
+    with pytest.raises(UserInputError, match=f"`sw bench` goes on with the sweep in {tmp_path}"):
+        collect([tmp_path])
 
 
 def test_many_failures_are_counted(tmp_path):

@@ -5,7 +5,7 @@ import json
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from sw_report.looks import looks_of
+from sw_report.method_styles import styles_of
 from sw_report.numbers import SHARED_NOTE
 from sw_report.plots import training_charts
 from sw_report.runs import collect
@@ -82,7 +82,7 @@ def test_the_page_draws_what_tasks_recorded(make_run):
             file.write(json.dumps({"stage": 0, "step": step, "scalars": {"dead <codes>": step}}) + "\n")
         file.write(json.dumps({"stage": 0, "step": 303, "scalars": {"only once": 1}}) + "\n")
     runs = collect([directory]).runs
-    charts, missing = training_charts(runs, looks_of(runs))
+    charts, missing = training_charts(runs, styles_of(runs))
     assert not missing
     assert [figure.caption for figure in charts.figures][2:] == ["dead <codes>"]
     assert "dead &lt;codes&gt; over steps" in str(charts.figures[2].svg)
@@ -122,7 +122,7 @@ def test_the_page_draws_quality_over_seconds(make_run):
             line = {"stage": 0, "step": step, "metrics": {"ssim": 0.5, "psnr": step / 10}, "train_s": step / 100}
             file.write(json.dumps(line) + "\n")
     runs = collect([directory]).runs
-    charts, _ = training_charts(runs, looks_of(runs))
+    charts, _ = training_charts(runs, styles_of(runs))
     captions = [figure.caption for figure in charts.figures]
     assert captions[1] == "PSNR of the test views over seconds of training, evaluation not counted"
     assert captions[2].startswith("SSIM")
@@ -136,7 +136,7 @@ def test_seconds_of_a_shared_machine_are_marked_below_the_curve(make_run):
             line = {"stage": 0, "step": step, "metrics": {"psnr": step / 10}, "train_s": step / 100}
             file.write(json.dumps(line) + "\n")
     runs = collect([directory]).runs
-    charts, _ = training_charts(runs, looks_of(runs))
+    charts, _ = training_charts(runs, styles_of(runs))
     marked = [figure.caption for figure in charts.figures if SHARED_NOTE in figure.caption]
     assert len(marked) == 1
     assert marked[0].startswith("PSNR of the test views over seconds")

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 from sw_view.entries import Opened, find_entries, open_entry
-from sw_view.exhibits import exhibit
 from sw_view.frames import camera_at, orientation_of
-from sw_view.looks import MODES
+from sw_view.mode_pictures import MODES
 from sw_view.shown_gaussians import ShownGaussians, shown_gaussians, sphere
+from sw_view.shown_models import shown_model
 
 from splatwizard_core.api import UserInputError
 from splatwizard_core.tooling import Choices, load_plugins
@@ -32,10 +32,10 @@ def opened() -> dict[str, Opened]:
 def test_every_model_is_shown_in_every_mode(opened, kind, mode):
     found = opened[kind]
     camera = found.around.cameras[0].camera.resized(48, 36)
-    pixels = exhibit(found).draw(camera, mode)
+    pixels = shown_model(found).draw(camera, mode)
     assert (pixels.shape, pixels.dtype) == ((36, 48, 3), np.uint8)
     assert pixels.max() > 0, "nothing is seen"
-    assert "bytes" in exhibit(found).told()
+    assert "bytes" in shown_model(found).told()
 
 
 def test_a_file_without_a_scene_has_cameras_of_its_own(opened):
@@ -100,7 +100,7 @@ def test_the_camera_of_a_browser_draws_like_one_of_the_scene(opened):
     found = opened["gaussians"]
     camera = found.around.cameras[0].camera.resized(48, 36)
     same = camera_at(orientation_of(camera), camera.center.numpy(), camera.fov_y, (48, 36))
-    draw = exhibit(found).draw
+    draw = shown_model(found).draw
     difference = np.abs(draw(camera, "picture").astype(int) - draw(same, "picture"))
     assert difference.max() <= 2  # float32 of the pose
     assert torch.allclose(same.R, camera.R, atol=1e-6)

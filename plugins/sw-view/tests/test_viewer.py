@@ -13,14 +13,14 @@ import pytest
 import torch
 from fake_viser import Client, Server
 from sw_view import frames
+from sw_view.browser_session import ELLIPSOIDS, SPLATS
 from sw_view.entries import find_all_entries
-from sw_view.exhibits import Exhibit
 from sw_view.live import LiveView
 from sw_view.shown_cameras import surroundings_about, surroundings_of
 from sw_view.shown_gaussians import ShownGaussians
+from sw_view.shown_models import ShownModel
 from sw_view.view_command import view
 from sw_view.viewer import Viewer, start_server
-from sw_view.visitor import ELLIPSOIDS, SPLATS
 
 from splatwizard_core.api import Camera, CapabilityError, GaussianModel, SceneOptions
 from splatwizard_core.cli.main import main
@@ -42,7 +42,7 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch) -> Clock:
     clock = Clock()
-    for module in ("viewer", "visitor"):
+    for module in ("viewer", "browser_session"):
         monkeypatch.setattr(f"sw_view.{module}.time", clock)
     return clock
 
@@ -54,14 +54,14 @@ def shown() -> ShownGaussians:
                           np.ones((n, 1), np.float32))  # fmt: skip
 
 
-def of_one_colour(value: int, drawn: list[tuple[Camera, str]]) -> Exhibit:
+def of_one_colour(value: int, drawn: list[tuple[Camera, str]]) -> ShownModel:
     def draw(camera: Camera, mode: str) -> np.ndarray:
         drawn.append((camera, mode))
         if mode == "normals":
             raise CapabilityError("no rasterizer offers normals")
         return np.full((camera.height, camera.width, 3), value, np.uint8)
 
-    return Exhibit(draw, lambda _camera: shown(), lambda: f"model {value}")
+    return ShownModel(draw, lambda _camera: shown(), lambda: f"model {value}")
 
 
 class Shown:
@@ -70,14 +70,14 @@ class Shown:
     def __init__(self, labels: tuple[str, ...] = ("10", "20")) -> None:
         self.server, self.drawn, self.opened = Server(), [], []
 
-        def open_label(label: str) -> Exhibit:
+        def open_label(label: str) -> ShownModel:
             self.opened.append(label)
             return of_one_colour(int(label), self.drawn)
 
         self.around = surroundings_about(POINTS)
         self.viewer = Viewer(self.server, self.around, labels, open_label)  # type: ignore[arg-type]
         self.client: Client = self.server.connect()
-        self.visitor = self.viewer._visitors[self.client.client_id]
+        self.session = self.viewer._sessions[self.client.client_id]
 
     def pictures(self) -> list[np.ndarray]:
         return self.client.scene.pictures
@@ -90,7 +90,7 @@ def test_a_browser_starts_at_the_first_camera_and_is_sent_a_picture(clock):
     one.viewer.pump(0)
     assert one.pictures()[-1].shape == (48, 64, 3)  # it never moved: in full
     assert (one.pictures()[-1] == 10).all()
-    assert "64 x 48" in one.visitor.told.content
+    assert "64 x 48" in one.session.told.content
     drawn_from = one.drawn[-1][0]
     torch.testing.assert_close(drawn_from.R, camera.R, atol=1e-5, rtol=0)
     # The camera's whole picture is in the window: 960 x 720 in 64 x 48, the same shape.
@@ -107,7 +107,7 @@ def test_nothing_is_drawn_twice(clock):
 def test_a_moving_camera_gets_fewer_pixels_and_all_of_them_when_it_rests(clock):
     one = Shown(("10",))
     one.viewer.pump(0)
-    one.visitor.pace.share = 0.5
+    one.session.pace.share = 0.5
     one.client.camera.say()
     one.viewer.pump(0)
     assert one.pictures()[-1].shape == (24, 32, 3)
@@ -124,10 +124,10 @@ def test_two_models_are_side_by_side_and_opened_once(clock):
     middle = two.pictures()[-1][0, :, 0]
     assert (middle[0], middle[-1]) == (10, 20)
     assert middle[32] == 255
-    two.visitor.split.say(value=0.25)
+    two.session.split.say(value=0.25)
     two.viewer.pump(0)
     assert two.pictures()[-1][0, 20, 0] == 20
-    two.visitor.beside.say(value="nothing")
+    two.session.beside.say(value="nothing")
     two.viewer.pump(0)
     assert (two.pictures()[-1] == 10).all()
     assert sorted(two.opened) == ["10", "20"]
@@ -135,11 +135,11 @@ def test_two_models_are_side_by_side_and_opened_once(clock):
 
 def test_what_cannot_be_drawn_is_told_and_another_mode_works(clock):
     one = Shown(("10",))
-    one.visitor.mode.say(value="normals")
+    one.session.mode.say(value="normals")
     one.viewer.pump(0)
     assert one.pictures() == []
-    assert "no rasterizer offers normals" in one.visitor.told.content
-    one.visitor.mode.say(value="depth")
+    assert "no rasterizer offers normals" in one.session.told.content
+    one.session.mode.say(value="depth")
     one.viewer.pump(0)
     assert len(one.pictures()) == 1
     assert one.drawn[-1][1] == "depth"
@@ -148,14 +148,14 @@ def test_what_cannot_be_drawn_is_told_and_another_mode_works(clock):
 def test_a_full_gpu_or_a_lost_file_is_told_and_ends_nothing(clock):
     for error in (RuntimeError("out of memory"), FileNotFoundError(2, "No such file", "scene.swz")):
 
-        def lost(_label: str, error: Exception = error) -> Exhibit:
+        def lost(_label: str, error: Exception = error) -> ShownModel:
             raise error
 
         server = Server()
         viewer = Viewer(server, surroundings_about(POINTS), ("10",), lost)  # type: ignore[arg-type]
-        visitor = viewer._visitors[server.connect().client_id]
+        session = viewer._sessions[server.connect().client_id]
         viewer.pump(0)
-        assert str(error) in visitor.told.content
+        assert str(error) in session.told.content
 
 
 def test_who_comes_while_a_picture_is_drawn_disturbs_nobody(clock):
@@ -163,17 +163,17 @@ def test_who_comes_while_a_picture_is_drawn_disturbs_nobody(clock):
     one.client.camera.say()
 
     class Enters(tuple):
-        """A visitor's last picture; to look at it lets another browser in, as viser's thread may."""
+        """A session's last picture; to look at it lets another browser in, as viser's thread may."""
 
         def __getitem__(self, index: Any) -> Any:
-            if len(one.viewer._visitors) == 1:
+            if len(one.viewer._sessions) == 1:
                 one.server.connect()
             return super().__getitem__(index)
 
-    one.visitor.drawn = Enters((9, 0, 0.5))
-    one.visitor.due = lambda *_: None  # type: ignore[method-assign]
+    one.session.drawn = Enters((9, 0, 0.5))
+    one.session.due = lambda *_: None  # type: ignore[method-assign]
     one.viewer.pump(0)
-    assert len(one.viewer._visitors) == 2
+    assert len(one.viewer._sessions) == 2
 
 
 def test_equal_names_in_two_folders_are_told_apart(tmp_path):
@@ -193,23 +193,23 @@ def test_equal_names_in_two_folders_are_told_apart(tmp_path):
 
 def test_ellipsoids_and_splats_are_sent_once_and_taken_away(clock):
     one = Shown(("10",))
-    one.visitor.mode.say(value=ELLIPSOIDS)
+    one.session.mode.say(value=ELLIPSOIDS)
     one.viewer.pump(0)
     one.client.camera.say()
     one.viewer.pump(0)
     ((name, node, options),) = one.client.scene.nodes
     assert name == "/ellipsoids"
     assert (options["batched_scales"] == 1).all()
-    one.visitor.sigmas.say(value=2.0)
+    one.session.sigmas.say(value=2.0)
     one.viewer.pump(0)
     assert node.removed
     assert (one.client.scene.nodes[-1][2]["batched_scales"] == 2).all()
-    one.visitor.mode.say(value=SPLATS)
+    one.session.mode.say(value=SPLATS)
     one.viewer.pump(0)
     name, splats, options = one.client.scene.nodes[-1]
     assert name == "/splats"
     assert options["arguments"][1].shape == (7, 3, 3)
-    one.visitor.mode.say(value="picture")
+    one.session.mode.say(value="picture")
     one.viewer.pump(0)
     assert splats.removed
     assert one.pictures()[-1].shape == (48, 64, 3)
@@ -273,7 +273,7 @@ def test_a_training_draws_for_who_looks_and_leaves_no_trace(live, training):
     client = server.connect()
     observer.after_step(model, step(2))
     assert client.scene.pictures[-1].max() > 0
-    told = observer._viewer._visitors[client.client_id].told.content
+    told = observer._viewer._sessions[client.client_id].told.content
     assert "step 2 of 10, loss 0.5000, 3 gaussians" in told
     assert model.training
     assert model.digest() == digest

@@ -21,9 +21,9 @@ import torch
 from headless_chromium import WEBGL, Chromium, find_chromium
 from PIL import Image
 from sw_view.entries import Opened, find_entries, open_entry
-from sw_view.exhibits import exhibit
 from sw_view.page_file import About, write_page, write_pair
 from sw_view.shown_cameras import surroundings_of
+from sw_view.shown_models import shown_model
 
 from splatwizard_core.api import Camera, GaussianModel, RasterOptions, Scene, SceneOptions
 from splatwizard_core.tooling import Choices, NegotiatedRasterizer, load_plugins, load_scene, render_view
@@ -244,7 +244,7 @@ def test_a_browser_is_sent_the_picture_of_its_camera(browser, opened):
     pytest.importorskip("viser", reason="pip install 'sw-view[viser]'")
     from sw_view.viewer import Viewer, start_server
 
-    viewer = Viewer(start_server("127.0.0.1", 0), opened.around, ["golden"], lambda _label: exhibit(opened))
+    viewer = Viewer(start_server("127.0.0.1", 0), opened.around, ["golden"], lambda _label: shown_model(opened))
     done = threading.Event()
 
     def pump() -> None:
@@ -260,10 +260,10 @@ def test_a_browser_is_sent_the_picture_of_its_camera(browser, opened):
         while best <= 30:
             assert time.monotonic() < until, f"the browser shows something else: {best:.1f} dB"
             time.sleep(0.2)
-            for visitor in viewer._visitors.values():
-                camera = visitor.camera(1.0)
+            for session in viewer._sessions.values():
+                camera = session.camera(1.0)
                 assert (camera.width, camera.height) == (640, 480)
-                sent = exhibit(opened).draw(camera, "picture")
+                sent = shown_model(opened).draw(camera, "picture")
                 data = browser.send("Page.captureScreenshot", format="png")["data"]
                 shown = np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
                 best = max(best, psnr(shown[part] / 255, sent[part] / 255))

@@ -18,7 +18,7 @@ from wisp_scenes import made_up
 from splatwizard_core.api import BitstreamError, ContainerReader, ContainerWriter
 from sw_wisp import file
 from sw_wisp.nested import Writer
-from sw_wisp.octree import Shares
+from sw_wisp.octree_contexts import ENDS, LEVELS, MORE, Shares
 
 NOISE = 16 << 20  # of the allocator, and of the tables that are made once
 FREE = 1 << 24  # bytes of rows that any file may stand for
@@ -111,7 +111,7 @@ def test_an_octree_of_many_nodes_and_few_splats_is_refused():
     """All bits 1: more cells than announced splats can fill."""
     stream = Writer()
     stream.bits(np.full(200_000, 4095), np.ones(200_000, bool))
-    shares = Shares(np.full((16, 4), 4095), np.zeros((16, 39), np.int64))
+    shares = Shares(np.full((LEVELS, 4), 4095), np.zeros(ENDS, np.int64), np.zeros((LEVELS, MORE), np.int64))
     scene = made_up(3)
     parts = Parts.of(written(scene))
     networks = dict(parts.sections)["networks"]

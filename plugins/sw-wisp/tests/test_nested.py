@@ -1,12 +1,15 @@
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import norm
 
 from splatwizard_core.api import BitstreamError
+from sw_codecs import testing
 from sw_codecs.entropy.exact_tables import exact_tables
 from sw_wisp import nested
+from sw_wisp.nested_model import NestedGaussian
 
 
 def normal_indices(ratio: float, n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -121,3 +124,15 @@ def test_no_symbols_are_no_bytes():
         nested.Reader(b"").indices(np.zeros(1, np.uint8), None)
     with pytest.raises(BitstreamError, match="left"):
         nested.Reader(b"abcd").finish()
+
+
+def case(n: int) -> testing.EntropyCase:
+    draws = np.random.default_rng(0)
+    levels = draws.uniform(5, 60, (n + 4) // 5 * 5).reshape(-1, 5)
+    symbols = np.rint(draws.normal(0, 0.05 * 1280 ** (levels / 63))).astype(np.int64)
+    scales = np.rint(4096 * levels).astype(np.int64)
+    return testing.EntropyCase(symbols, scales, torch.from_numpy(levels), scales)
+
+
+def test_the_entropy_model_keeps_its_contract():
+    testing.check_entropy_model(NestedGaussian, case)

@@ -1,7 +1,17 @@
-"""`python -m splatwizard_core` is `sw`."""
+"""`sw`, and `python -m splatwizard_core`."""
 
 import sys
 
-from splatwizard_core.cli.main import main
 
-sys.exit(main())
+def start() -> int:
+    """Run `sw` and return its exit status; a Ctrl-C is answered in one line while modules are imported, too."""
+    try:
+        from splatwizard_core.cli.main import main
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+    return main()
+
+
+if __name__ == "__main__":
+    sys.exit(start())

@@ -31,6 +31,7 @@ MODULES = {
     "scene.locate": "DATA_VARIABLE",
     "training.pipeline": "TrainingRun TrainingStopped",
     "training.scheduler": "build_schedulers",
+    "training.keys": "block_keys",
     "training.params": "SceneParams",
     "base.toml_file": "read_toml",
     "coding.limits": "decoded_limit",

@@ -1,5 +1,6 @@
 """The command line: what it says, where it says it, and with which exit status."""
 
+import importlib.abc
 import json
 import math
 import os
@@ -15,6 +16,7 @@ import pytest
 from counted_lines import lines_of_process
 from sw_gaussians.start import gaussians_from_points
 
+from splatwizard_core.__main__ import start
 from splatwizard_core.cli.main import cli, main
 from splatwizard_core.plugins import catalogue, load_plugins
 from splatwizard_core.runs import file_needs
@@ -214,6 +216,20 @@ def test_a_group_alone_shows_its_help_and_is_status_2(arguments: list[str], caps
     told = capsys.readouterr()
     assert told.out == ""
     assert told.err.startswith("Usage: sw")
+
+
+def test_an_interrupt_while_modules_are_imported_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    class Interrupting(importlib.abc.MetaPathFinder):
+        def find_spec(self, name: str, *_: object) -> None:
+            if name == "splatwizard_core.cli.main":
+                raise KeyboardInterrupt
+
+    monkeypatch.delitem(sys.modules, "splatwizard_core.cli.main", raising=False)
+    monkeypatch.setattr("sys.meta_path", [Interrupting(), *sys.meta_path])
+    assert start() == 130
+    assert capsys.readouterr().err == "interrupted\n"
 
 
 def test_an_interrupt_is_status_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):

@@ -287,6 +287,20 @@ def test_what_cannot_run_here_is_skipped_and_told_if_only_the_oracle_remains(plu
     assert warnings(caplog) == []
 
 
+def test_the_user_hears_why_a_preferred_one_does_not_serve_and_a_method_s_choice_is_passed_over(plugins, scene, caplog):
+    plugins.install("absent", available="negotiation_fakes:not_here", speed=9)
+    plugins.install("elsewhere", devices=("cuda",))
+    plugins.install("other", speed=1)
+    for names in ({"suggested": ["absent", "elsewhere"]}, {"prefer": ["absent", "elsewhere"]}):
+        rasterizer = NegotiatedRasterizer(plugins, device="cpu", **names)
+        rasterizer.render(*scene, RasterOptions())
+        assert rasterizer.choices == {"plain": "other"}
+        assert bool(warnings(caplog)) is ("prefer" in names)
+    elsewhere, absent = warnings(caplog)
+    assert elsewhere == "'elsewhere', which raster.prefer names, does not draw on cpu"
+    assert NOT_HERE in absent
+
+
 def test_a_probe_that_raises_counts_as_a_reason(plugins, scene):
     plugins.install("absent", available="negotiation_fakes:broken_probe", speed=9)
     rasterizer = NegotiatedRasterizer(plugins, device="cpu")

@@ -267,11 +267,12 @@ WRITES = ("os.rename", "os.remove", "os.rmdir", "os.mkdir", "os.truncate")
 OPENED_TO_WRITE = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 
 
-def die_before_a_write(when, notes):
+def die_before_a_write(when, notes, signal=9):
     '''Kill this process, and of a child its parent first, before the n-th time that it changes what is on a disk.
 
     when    COMMAND:N, such as run:7; N = 0: never. Or COMMAND:TEXT: the first time that the line about it holds TEXT
     notes   path of a file that gets a line for each such time
+    signal  what it is sent: another one than SIGKILL may only stop it for a while
     '''
     command, _, count = when.partition(":")
     mine = sys.argv[1]
@@ -291,9 +292,10 @@ def die_before_a_write(when, notes):
         os.write(lines, f"{line}\\n".encode())
         left -= 1
         if left == 0 or (left < 0 and count in line and not count.isdigit()):
+            left = sys.maxsize  # once
             if mine in ("decode", "eval"):
-                os.kill(os.getppid(), 9)
-            os.kill(os.getpid(), 9)
+                os.kill(os.getppid(), signal)
+            os.kill(os.getpid(), signal)
 
     sys.addaudithook(watch)
 """
@@ -306,7 +308,9 @@ from splatwizard_core.plugins import hookimpl
 if "TOY_DEATH" in os.environ:
     import toy_death
 
-    toy_death.die_before_a_write(os.environ["TOY_DEATH"], os.environ["TOY_WRITES"])
+    toy_death.die_before_a_write(
+        os.environ["TOY_DEATH"], os.environ["TOY_WRITES"], int(os.environ.get("TOY_SIGNAL", "9"))
+    )
 
 
 @hookimpl

@@ -29,8 +29,14 @@ class Codec(Params):
     bits: dict[str, int] = {"means": 16}
 
 
+class Part(Params):
+    size: int
+    word: str = Field("a", min_length=1)
+
+
 class Config(OptimizationParams):
     steps: list[int] = [1, 2]
+    parts: list[Part] = []
     densify: Densify = Densify()
     codec: Codec = Codec()
 
@@ -314,6 +320,9 @@ def test_an_unknown_preset_lists_those_there_are():
         ("[densify]\ngrad_treshold = 1", r"unknown key 'densify.grad_treshold' in .*c.toml"),
         ("iterations = 'many'", r"bad value 'many' for 'iterations' in .*c.toml"),
         ("seed = 2.0", r"bad value 2.0 for 'seed' in .*c.toml: must be a valid integer"),
+        ("parts = [{}]", r"c.toml: 'parts.0.size' is missing"),
+        ("parts = [{ size = 1, sise = 2 }]", r"for 'parts' in .*c.toml: must be left out: there is no such key"),
+        ("parts = [{ size = 1, word = '' }]", r"for 'parts' in .*c.toml: must be a text that is not empty"),
         (f"iterations = {10**26}", "bad value '1000.*' for 'iterations' in .*: an integer does not fit 64 bits"),
         ("iterations = 1e26", "bad value 1e.26 for 'iterations' in .*: must be a whole number that fits 64 bits"),
         (f"iterations = {10**10}", "bad value 10000000000 for 'iterations' in .*: must be less than or equal to 10000"),
@@ -330,6 +339,22 @@ def test_a_wrong_file_is_named(tmp_path: Path, content: str, message: str):
     file.write_text(content)
     with pytest.raises(ConfigError, match=message):
         resolved(file=file)
+
+
+def test_keys_of_an_older_release_are_told_with_those_of_today_where_the_user_gives_them(caplog):
+    class Moved(Config):
+        def spelled(self, values):
+            return {{"old": "densify.grad_threshold"}.get(key, key): value for key, value in values.items()}
+
+    class Newer(Toy):
+        Config = Moved
+        PRESETS = {"paper": {"old": 3.0}, "quick": {}}
+
+    assert resolve(Newer, "paper").config.densify.grad_threshold == 3.0
+    assert caplog.messages == []
+    for _ in range(2):
+        assert resolve(Newer, sets={"old": 4.0, "seed": 1}).config.densify.grad_threshold == 4.0
+    assert caplog.messages == ["--set: old of release 0.2 is now densify.grad_threshold (docs/migration.md)"]
 
 
 def test_a_missing_file_is_named(tmp_path: Path):

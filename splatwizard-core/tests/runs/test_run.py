@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import forked_children
 import pytest
 import torch
 
@@ -24,7 +25,7 @@ from splatwizard_core.runs.run import run, train_in, train_only
 from splatwizard_core.runs.session import Session
 from splatwizard_core.runs.training import trained_scene
 
-pytestmark = [pytest.mark.pipeline, pytest.mark.usefixtures("new_interpreters")]
+pytestmark = pytest.mark.pipeline
 
 
 def config(plugins: PluginManager, *sets: str, method: str = "toy", rate: str | None = None) -> ResolvedConfig:
@@ -48,11 +49,13 @@ class Run:
 
 @pytest.fixture(scope="module")
 def done(toy_plugins: PluginManager, tmp_path_factory: pytest.TempPathFactory):
-    """Two rate points, run one after the other: (records, what was said, root)."""
+    """Two rate points, run one after the other: (records, what was said, root). The first starts new interpreters."""
     out = tmp_path_factory.mktemp("out")
     invocation = Run(toy_plugins, out)
-    records = [invocation("codec.fault=look around", rate=rate)[0] for rate in ("r1", "r2")]
-    return records, invocation.said, out
+    with forked_children.starting():
+        first, _ = invocation("codec.fault=look around", rate="r1")
+    second, _ = invocation("codec.fault=look around", rate="r2")
+    return (first, second), invocation.said, out
 
 
 def test_the_record_holds_what_the_protocol_asks_for(done):

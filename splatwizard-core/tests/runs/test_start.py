@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -310,10 +309,10 @@ def test_a_finished_student_is_encoded_from_its_directory(toy_plugins, tmp_path,
     assert f"{size:,} bytes, {1 / facts['ratio']:.1f} x larger than its parameters as float32, in " in told  # a toy
 
 
-def sw(arguments: list[str], **options: object) -> "subprocess.Popen[str]":
+def sw_train(method: str, out: Path, **environment: str) -> "subprocess.Popen[str]":
     return subprocess.Popen(
-        [sys.executable, "-m", "splatwizard_core", *arguments],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options,
+        [sys.executable, "-m", "splatwizard_core", "train", "--method", method, "--scene", "demo:tiny", "--out", out],
+        env={**os.environ, **environment}, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
 
 
@@ -321,24 +320,24 @@ def sw(arguments: list[str], **options: object) -> "subprocess.Popen[str]":
 def test_two_processes_that_want_the_same_scene_train_it_once(toy_plugins, tmp_path, first):
     """The second comes while the first trains it: to start from it, or as a run of its own.
 
-    The first is stopped in the middle until the second has found it at work.
+    The first stops itself before its first checkpoint, until the second has found it at work.
     """
-    steps = ["--set", "pretrained.iterations=400"] if first != "toy" else ["--set", "iterations=400"]
-    out = ["--scene", "demo:tiny", "--out", str(tmp_path)]
-    one = sw(["train", "--method", first, *out, *steps])
-    while not list(tmp_path.rglob("log.jsonl")):
-        assert one.poll() is None, one.communicate()
-        time.sleep(0.01)
-    one.send_signal(signal.SIGSTOP)
-    two = sw(["train", "--method", "toy-taught", *out, "--set", "pretrained.iterations=400"])
+    stop = str(int(signal.SIGSTOP))
+    one = sw_train(
+        first, tmp_path, TOY_DEATH="train:/checkpoints", TOY_SIGNAL=stop, TOY_WRITES=str(tmp_path / "writes")
+    )
+    _, status = os.waitpid(one.pid, os.WUNTRACED)
+    assert os.WIFSTOPPED(status), one.communicate()
+    two = sw_train("toy-taught", tmp_path)
     assert two.stderr is not None
     lines: list[str] = []
     while not any("is being written by process" in line for line in lines):
         lines.append(two.stderr.readline())
-        assert lines[-1] != "", lines
+        if lines[-1] == "":
+            one.kill()
+            pytest.fail(f"it has not waited: {lines}")
     one.send_signal(signal.SIGCONT)
-    told = [one.communicate()[1], "".join(lines) + two.stderr.read()]
-    two.wait()
+    told = [one.communicate()[1], "".join(lines) + two.communicate()[1]]
     assert (one.returncode, two.returncode) == (0, 0), told
     assert sum(text.count("training toy on ") for text in told) == 1
     assert f"is being written by process {one.pid}" in told[1]

@@ -6,7 +6,7 @@ import zlib
 import pytest
 
 from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.training.figures import TrainingFigures
+from splatwizard_core.training.measurements import TrainingFigures
 from splatwizard_core.training.params import OptimizationParams
 from splatwizard_core.training.pipeline import TrainingStopped
 from splatwizard_core.training.state import TrainingState

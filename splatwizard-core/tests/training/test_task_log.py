@@ -106,7 +106,7 @@ def test_a_value_is_that_of_its_step_and_the_last_one_counts():
 
 @pytest.mark.parametrize(("name", "value"), [("", 1.0), ("rows", torch.ones(2)), ("rows", torch.ones(0))])
 def test_what_is_no_point_of_a_curve_is_refused(name, value):
-    with pytest.raises(ValueError, match="one number a step"):
+    with pytest.raises(ValueError, match="one number per step"):
         TaskLog().scalar(name, value)
 
 

@@ -30,9 +30,10 @@ from splatwizard_native.fused.in_backward import offer_update as offer_update
 from splatwizard_native.fused.in_backward import offered_update as offered_update
 from splatwizard_native.fused.photometric import Padding as Padding
 from splatwizard_native.fused.photometric import photometric as photometric
-from splatwizard_native.interrupt import InterruptGuard as InterruptGuard
 from splatwizard_native.lazy_imports import lazy_exports as lazy_exports
-from splatwizard_native.machine import describe_machine as describe_machine
+from splatwizard_native.lock import HeldError as HeldError
+from splatwizard_native.lock import file_lock as file_lock
+from splatwizard_native.lock import read_holder as read_holder
 from splatwizard_native.memory import MemoryMeter as MemoryMeter
 from splatwizard_native.memory import peak_rss_bytes as peak_rss_bytes
 from splatwizard_native.memory import reset_peak_rss as reset_peak_rss
@@ -43,13 +44,6 @@ from splatwizard_native.operations import operations as operations
 from splatwizard_native.progress import Bar as Bar
 from splatwizard_native.progress import duration as duration
 from splatwizard_native.progress import track as track
-from splatwizard_native.random_states import capture_random_states as capture_random_states
-from splatwizard_native.random_states import one_order_of_sums as one_order_of_sums
-from splatwizard_native.random_states import preserved_random_states as preserved_random_states
-from splatwizard_native.random_states import restore_random_states as restore_random_states
-from splatwizard_native.random_states import seeded as seeded
-from splatwizard_native.scalars import Verdict as Verdict
-from splatwizard_native.scalars import read_scalars as read_scalars
 from splatwizard_native.settings import cache_root as cache_root
 from splatwizard_native.settings import fast_enabled as fast_enabled
 from splatwizard_native.strict_json import dump_strict as dump_strict

@@ -193,7 +193,7 @@ class AnchorModel(AnchorSplats):
     opacity_accum, anchor_denom         [N] buffers: sum of max(opacity, 0) of an anchor's offsets, views seen in
     offset_grad_accum, offset_denom     [N,k] buffers: sum of screen-space gradients (NDC), views drawn in
 
-    A method that quantises or masks overrides `positions` and `attributes`; one with further parameters a row also
+    A method that quantises or masks overrides `positions` and `attributes`; one with further parameters per row also
     extends ROWS and `rows_at`. Source: Scaffold-GS (arXiv 2312.00109) as used by HAC (arXiv 2403.14530).
     """
 

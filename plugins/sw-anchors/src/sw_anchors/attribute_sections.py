@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 Coders = Mapping[type, Any]
-"""Type of a context -> the entropy model that takes it, with `encode` and `decode`."""
+"""Type of distributions -> the entropy model that takes it, with `encode` and `decode`."""
 
 
 class Block(NamedTuple):
@@ -54,18 +54,18 @@ class AttributeCoder:
     ) -> None:
         """Set up for `count` anchors; mode "exact" or "float" of the entropy model `conditional-gaussian`.
 
-        further     entropy models for other contexts than its own
+        further     entropy models for distributions of other types
         """
         self.coder: ConditionalGaussian = plugins.entropy_models.load("conditional-gaussian")(mode)
         self.further = further or {}
         self.rows = self.coder.blocks(count, max(shape.widths))
 
-    def code(self, block: Block, context: Any, step: Tensor, present: Tensor | None = None) -> Tensor:
+    def code(self, block: Block, distributions: Any, step: Tensor, present: Tensor | None = None) -> Tensor:
         """Code one block; return its integers [n,C] int64, 0 where they are not in the file.
 
-        context     distributions of its numbers in the units of the mode: RowContext, RowLattice, or a `further` one
-        step        [n,1] float64, quantiser steps in units of the values
-        present     [n,C] bool: numbers that are in the file; None: all
+        distributions   of its numbers in the units of the mode: RowContext, RowLattice, or a `further` one
+        step            [n,1] float64, quantiser steps in units of the values
+        present         [n,C] bool: numbers that are in the file; None: all
         """
         raise NotImplementedError
 
@@ -87,12 +87,12 @@ class AttributeEncoder(AttributeCoder):
         self._centres = dict(zip(GROUPS, (c.cpu() for c in model.centres()), strict=True))
         self._coded: dict[str, list[bytes]] = {name: [] for name in sections}
 
-    def code(self, block: Block, context: Any, step: Tensor, present: Tensor | None = None) -> Tensor:
+    def code(self, block: Block, distributions: Any, step: Tensor, present: Tensor | None = None) -> Tensor:
         values = self._values[block.group][block.rows, block.columns].double()
         symbols = symbols_of(values, step, self._centres[block.group])
         symbols = symbols if present is None else symbols * present
-        coder = self.further.get(type(context), self.coder)
-        self._coded[block.section].append(coder.encode(symbols.numpy(), context, present))
+        coder = self.further.get(type(distributions), self.coder)
+        self._coded[block.section].append(coder.encode(symbols.numpy(), distributions, present))
         return symbols
 
     def write(self, writer: ContainerWriter) -> None:
@@ -123,14 +123,14 @@ class AttributeDecoder(AttributeCoder):
             name: self.coder.split(reader.section(name), len(self.rows)) for name in sections
         }
 
-    def code(self, block: Block, context: Any, step: Tensor, present: Tensor | None = None) -> Tensor:
+    def code(self, block: Block, distributions: Any, step: Tensor, present: Tensor | None = None) -> Tensor:
         """Raises BitstreamError for damage."""
         with self._reader.decoding(block.section):
             data = next(self._coded[block.section])
             values = self._found[block.group][block.rows, block.columns]
-            if type(context) not in self.further:
-                return self.coder.decode_into(values, data, context, step, present)
-            symbols = torch.from_numpy(self.further[type(context)].decode(data, context, present))
+            if type(distributions) not in self.further:
+                return self.coder.decode_into(values, data, distributions, step, present)
+            symbols = torch.from_numpy(self.further[type(distributions)].decode(data, distributions, present))
             values.copy_(symbols * step)
         return symbols
 
@@ -208,7 +208,7 @@ class ExactNetwork:
             for i, group in enumerate(GROUPS)
         }
 
-    def steps(self, group: str, context: RowContext | RowLattice) -> Tensor:
+    def steps(self, group: str, distributions: RowContext | RowLattice) -> Tensor:
         """Return quantiser steps [n,1] float64 of a group, in units of the values."""
-        multipliers = torch.as_tensor(context.step)
+        multipliers = torch.as_tensor(distributions.step)
         return multipliers.to(torch.float64) * (self._base_steps[GROUPS.index(group)] / (1 << FRACTION))

@@ -20,7 +20,7 @@ from sw_anchors.noisy_values import FULL as FULL
 from sw_anchors.noisy_values import MASK_THRESHOLD, Noise, NoisyValues, draws, noisy_values
 from sw_anchors.noisy_values import QUANTIZED as QUANTIZED
 from sw_anchors.older_coded_anchors import PredictedRate
-from sw_anchors.rate_model import AnchorRate, Context, Floors, RateModel, Triple, triple
+from sw_anchors.rate_model import AnchorRate, Floors, RateInputs, RateModel, Triple, triple
 from sw_codecs.quantizers.multiples import nearest_index
 from sw_codecs.quantizers.straight_through import hard_mask
 
@@ -59,7 +59,6 @@ class CodedAnchors(AnchorModel):
         *,
         margin: Margin = "none",
         base_steps: tuple[float, float, float] = (1.0, 0.001, 0.2),
-        noise_factor: float = 1.0,
         sample: float = 0.05,
         smallest_probability: float = 1e-6,
         scale_floor: float = 0.0,
@@ -68,7 +67,6 @@ class CodedAnchors(AnchorModel):
         """Initialise like AnchorModel, which gets `kwargs`.
 
         margin          of the bounds, see `lattice.bounds_of`
-        noise_factor    multiplies the base steps in the phase QUANTIZED
         sample          share of the anchors whose rate is computed
         smallest_probability, scale_floor   floors of the rate in training, see `rate_model.Floors`
         """
@@ -79,7 +77,7 @@ class CodedAnchors(AnchorModel):
         self.phase = FULL
         self.noise: torch.Generator | None = None
         self.margin: Margin = margin
-        self.base_steps, self.noise_factor = base_steps, noise_factor
+        self.base_steps = base_steps
         self.sample, self.smallest_probability = sample, smallest_probability
         self.scale_floor = scale_floor
         self._lattice: tuple[tuple[Any, ...], Tensor, Tensor] | None = None
@@ -160,11 +158,11 @@ class CodedAnchors(AnchorModel):
         """Return the rate model, which predicts quantiser steps and distributions in training and for the file."""
         return PredictedRate(self)
 
-    def context_rows(self) -> Context:
+    def context_rows(self) -> RateInputs:
         """Return the inputs of the rate model, one row per anchor of the model."""
         return (torch.arange(self.num_rows, device=self.device),)
 
-    def context_of(self, rows: Tensor) -> Context:
+    def context_of(self, rows: Tensor) -> RateInputs:
         """Return the inputs of the rate model for the anchors `rows`."""
         return tuple(part.index_select(0, rows) for part in self.context_rows())
 
@@ -181,8 +179,7 @@ class CodedAnchors(AnchorModel):
         if self.phase == FULL:
             values = self._values(rows, None)
         elif self.phase == QUANTIZED:
-            steps = self.base_steps_like(self.features)[None] * self.noise_factor
-            values = self._values(rows, Noise(steps, self._draw_noise(rows)))
+            values = self._values(rows, Noise(self.noise_steps(self.features), self._draw_noise(rows)))
         elif self.RATE_OF == "visible":
             values, rate["rate"] = self._with_rate_of_visible(rows)
         else:
@@ -226,6 +223,10 @@ class CodedAnchors(AnchorModel):
     @property
     def _tables(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         return self.features, self.log_scales, self.offsets, self.mask_logits
+
+    def noise_steps(self, like: Tensor) -> Tensor:
+        """Return the steps [1,3] of the noise in the phase QUANTIZED: the base steps."""
+        return self.base_steps_like(like)[None]
 
     def base_steps_like(self, like: Tensor) -> Tensor:
         """Return base steps [3] with device and dtype of `like`, cached to avoid a host-device wait per step."""

@@ -53,12 +53,12 @@ def spawn(
     mlp_opacity, mlp_cov, mlp_color = networks
     toward = positions - center
     distance = torch.linalg.vector_norm(toward, dim=1, keepdim=True)
-    context = torch.cat([features, toward / distance, distance], dim=1)  # [V, F+4]
-    alphas = torch.tanh(mlp_opacity(context))  # [V,k]
+    inputs = torch.cat([features, toward / distance, distance], dim=1)  # [V, F+4]
+    alphas = torch.tanh(mlp_opacity(inputs))  # [V,k]
     opacities = alphas if masks is None else alphas * masks
     drawn = torch.nonzero(opacities.detach().reshape(-1) > 0).squeeze(1)  # [M]
     owner = torch.div(drawn, alphas.shape[1], rounding_mode="floor")  # [M]
-    geometry = mlp_cov(context).reshape(-1, GEOMETRY).index_select(0, drawn)
+    geometry = mlp_cov(inputs).reshape(-1, GEOMETRY).index_select(0, drawn)
     own = scales.index_select(0, owner)  # [M,6]
     shifts = offsets.reshape(-1, 3).index_select(0, drawn) * own[:, :3]
     return NeuralGaussians(
@@ -67,7 +67,7 @@ def spawn(
         # Noise or rounding may take a base scale through zero: a Gaussian of scale -s is that of scale s.
         scales=own[:, 3:].abs() * torch.sigmoid(geometry[:, :3]),
         quats=nn.functional.normalize(geometry[:, 3:], dim=1),
-        colors=torch.sigmoid(mlp_color(context)).reshape(-1, 3).index_select(0, drawn),
+        colors=torch.sigmoid(mlp_color(inputs)).reshape(-1, 3).index_select(0, drawn),
         all_opacities=opacities.detach(),
         alphas=alphas.detach(),
         drawn=drawn,

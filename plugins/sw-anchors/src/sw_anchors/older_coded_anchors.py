@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from sw_anchors import rate_model
-from sw_anchors.rate_model import AnchorForecast, AnchorRate, Context, Rows, Triple, gaussian_rate, triple
+from sw_anchors.rate_model import AnchorForecast, AnchorRate, RateInputs, Rows, Triple, gaussian_rate, triple
 
 __all__ = ["AnchorContext", "AnchorForecast", "AnchorRate", "PredictedRate", "Triple", "triple"]
 
 
 @dataclass(frozen=True)
-class AnchorContext(rate_model.AnchorContext):
+class AnchorContext(rate_model.AnchorDistributions):
     """Prediction of `predict`, with the bits of what the context model itself stores."""
 
     own_bits: Tensor | None = None
@@ -36,9 +36,9 @@ class PredictedRate:
         )
         self._model = model
 
-    def forecast(self, context: Context, sample: Rows) -> AnchorForecast:
+    def forecast(self, inputs: RateInputs, sample: Rows) -> AnchorForecast:
         """Predict for rows of the model."""
-        found = self._model.predict(*context)
+        found = self._model.predict(*inputs)
         steps = torch.cat(found.steps, dim=1)
         outputs = torch.cat([*found.means, *found.scales], dim=1)
         return AnchorForecast(steps, steps[sample], outputs[sample], getattr(found, "own_bits", None))
@@ -47,7 +47,9 @@ class PredictedRate:
         """Count the bits of values [S,C] under Gaussians, which `refine` sees the features of."""
         widths = list(self._model.shape.widths)
         means, scales = (triple(half.split(widths, dim=1)) for half in forecast.outputs.chunk(2, dim=1))
-        found: rate_model.AnchorContext = AnchorContext(means, scales, triple(forecast.sample_steps.split(1, dim=1)))
+        found: rate_model.AnchorDistributions = AnchorContext(
+            means, scales, triple(forecast.sample_steps.split(1, dim=1))
+        )
         if hasattr(self._model, "refine"):
             found = self._model.refine(found, values[:, : widths[0]])
         mean, scale = torch.cat(found.means, dim=1), torch.cat(found.scales, dim=1)

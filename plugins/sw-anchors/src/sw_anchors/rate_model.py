@@ -1,8 +1,8 @@
 """Rate models: prediction of how attributes of anchors are distributed, in training and for the file alike.
 
 One object, built from the same grids and networks, gives the bits of a sample in training (`rate`) and the integer
-distributions of the file (`exact`): training minimises the size of the file itself. A `Context` is what a rate model
-predicts from, an `AnchorContext` the distributions that it predicts.
+distributions of the file (`exact`): training minimises the size of the file itself. `RateInputs` are what a rate model
+predicts from, `AnchorDistributions` what it predicts.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from sw_anchors.shape import AnchorShape
 from sw_codecs.entropy.rates import gaussian_bits, lower_bound
 
 Triple = tuple[Tensor, Tensor, Tensor]
-Context = tuple[Tensor, ...]
+RateInputs = tuple[Tensor, ...]
 """Inputs of a rate model: tensors with a row per anchor, without gradients, known before any attribute is decoded."""
 Rows: TypeAlias = "Tensor | slice"
-"""Rows of a context: int64 indices, or a slice to the end."""
+"""Rows of `RateInputs`: int64 indices, or a slice to the end."""
 
 SMALLEST_SCALE = 1e-9
 """Lower bound of a predicted standard deviation, as published."""
@@ -66,8 +66,8 @@ class RateModel(Protocol):
     the trained model for it, and the decoder builds it from the file.
     """
 
-    def forecast(self, context: Context, sample: Rows) -> AnchorForecast:
-        """Return quantiser steps of the anchors of `context`, and what `rate` needs of its rows `sample`.
+    def forecast(self, inputs: RateInputs, sample: Rows) -> AnchorForecast:
+        """Return quantiser steps of the anchors of `inputs`, and what `rate` needs of its rows `sample`.
 
         Differentiable; shapes depend on no value, and nothing waits for the device.
         """
@@ -88,7 +88,7 @@ class RateModel(Protocol):
 
 
 @dataclass(frozen=True)
-class AnchorContext:
+class AnchorDistributions:
     """Distributions of the attributes of V anchors: a triple for each of `shape.GROUPS`, in the units of the values.
 
     means, scales   [V,C] of each group: mean and standard deviation of every number; scales may be <= 0

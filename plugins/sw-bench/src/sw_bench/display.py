@@ -131,7 +131,7 @@ class LiveTable(Lines):
             self._console.print(escape(line), soft_wrap=True, highlight=False)
 
     def tick(self, sweep: Sweep) -> None:
-        """Draw again, once a second."""
+        """Draw again, once per second."""
         if time.monotonic() - self._drawn >= REFRESH_SECONDS:
             self._draw(sweep)
 

@@ -20,7 +20,7 @@ class ChannelAr(nn.Module):
     """Slices of sizes n_1 .. n_S; for slice i >= 2 a network sum of n_j<i -> hidden, ReLU -> 2 n_i.
 
     slices      sizes in order
-    refined     further attribute -> how many values a row it has: a network from all slices -> 2 n for each
+    refined     further attribute -> how many values per row it has: a network from all slices -> 2 n for each
     The last layers start at zero: before training nothing is refined.
     """
 

@@ -8,7 +8,7 @@ from typing import ClassVar, Literal
 from pydantic import Field
 from sw_anchors.lattice import Margin
 from sw_anchors.params import CodedAnchorLearningRates, CodedAnchorParams
-from sw_gaussians.named_blocks import Choosing, Moved, OwnCodec
+from sw_gaussians.named_blocks import SWITCH, Choosing, Moved, OwnCodec
 
 from splatwizard_core.api import Params
 
@@ -130,7 +130,7 @@ class CatConfig(Choosing, CodedAnchorParams):
     FULL_ITERATIONS: ClassVar[int] = FULL_RUN
     OLDER: ClassVar[Mapping[str, Moved]] = {
         f"codec.{name}": Moved((f"codec.settings.{name}",)) for name in FileSettings.model_fields
-    } | {"graphs": Moved(())}
+    } | {"graphs": Moved((), SWITCH)}
 
     iterations: int = Field(FULL_RUN, ge=1, description="steps; plans keep their ranges, tasks past the end never fire")
     bound_margin: Literal["hac", "extent", "none"] = Field(

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from sw_anchors.anchors import linear_layers
 from sw_anchors.lattice import low_and_step
-from sw_anchors.rate_model import AnchorContext, Triple, triple
+from sw_anchors.rate_model import AnchorDistributions, Triple, triple
 from sw_anchors.shape import AnchorShape
 from torch import Tensor, nn
 
@@ -151,7 +151,7 @@ class CatContext(nn.Module):
 
     # Prediction in training
 
-    def forward(self, places: Tensor) -> AnchorContext:
+    def forward(self, places: Tensor) -> AnchorDistributions:
         """Predict steps and distributions of anchors at places [V,3]; differentiable."""
         return self.read(self.outputs(places))
 
@@ -161,12 +161,12 @@ class CatContext(nn.Module):
         found: Tensor = self.network(look_up(self.triplane, places, rounded=self.rounded))
         return found
 
-    def read(self, outputs: Tensor) -> AnchorContext:
+    def read(self, outputs: Tensor) -> AnchorDistributions:
         """Read outputs [V,W] of the network as means and deviations [V,C] and steps [V,1] of each group."""
         out = outputs.split(self.shape.outputs, dim=1)
         steps = (STEP_OFFSET + torch.tanh(out[6])) * out[6].new_tensor(self.shape.base_steps)  # [V,3]
         means, scales = ([out[2 * i + second] * unit for i, unit in enumerate(self.units)] for second in (0, 1))
-        return AnchorContext(triple(means), triple(scales), triple(steps.split(1, dim=1)))
+        return AnchorDistributions(triple(means), triple(scales), triple(steps.split(1, dim=1)))
 
     def refined(self, means: Sequence[Tensor], scales: Sequence[Tensor], features: Tensor) -> tuple[Triple, Triple]:
         """Refine means and scales of the groups by features [V,F]."""

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import torch
 from sw_anchors.coded_anchors import CodedAnchors
-from sw_anchors.rate_model import Context
+from sw_anchors.rate_model import RateInputs
 from torch import Tensor
 
 from splatwizard_core.api import Camera, Rasterizer
@@ -33,7 +33,7 @@ class CatAnchors(CodedAnchors):
 
     def __init__(self, *tensors: Tensor, context: CatContext, view_factor: float = 1.0, **kwargs: Any) -> None:
         """Tensors and other arguments as of CodedAnchors."""
-        super().__init__(*tensors, base_steps=context.shape.base_steps, noise_factor=STEP_OFFSET, **kwargs)
+        super().__init__(*tensors, base_steps=context.shape.base_steps, **kwargs)
         self.context = context.to(self.anchors.device)
         self.view_factor = view_factor
         self.views_stale = True
@@ -44,6 +44,10 @@ class CatAnchors(CodedAnchors):
     def __getstate__(self) -> dict[str, Any]:
         """A copy works out anew where its anchors lie."""
         return {**self.__dict__, "_places": None}
+
+    def noise_steps(self, like: Tensor) -> Tensor:
+        """Return the base steps times the factor of a predicted step whose logit is 0."""
+        return super().noise_steps(like) * STEP_OFFSET
 
     def mask_weights(self) -> Tensor:
         return self.view_weights[:, None]
@@ -66,7 +70,7 @@ class CatAnchors(CodedAnchors):
             kept = self._places = (key, self.context.places(codes, self.bounds))
         return kept[1]
 
-    def context_rows(self) -> Context:
+    def context_rows(self) -> RateInputs:
         """The places of the anchors in the triplane; their sites on the planes, where `fast` takes these."""
         triplane, places = self.context.triplane, self.places()
         return plane_sites.kept_sites(triplane, places) if plane_sites.fits(triplane) else (places,)

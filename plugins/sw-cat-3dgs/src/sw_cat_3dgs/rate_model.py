@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from sw_anchors.attribute_sections import ExactNetwork
 from sw_anchors.float_mode import Mode
-from sw_anchors.rate_model import PUBLISHED_FLOORS, AnchorForecast, Context, Floors, Rows, gaussian_rate
+from sw_anchors.rate_model import PUBLISHED_FLOORS, AnchorForecast, Floors, RateInputs, Rows, gaussian_rate
 from sw_anchors.row_parts import MAX_FLOAT_NUMBERS, by_parts
 from sw_anchors.shape import GROUPS
 from torch import Tensor
@@ -35,7 +35,7 @@ class CatRateModel:
     base: Tensor
     floors: Floors = PUBLISHED_FLOORS
 
-    def forecast(self, rows: Context, sample: Rows) -> AnchorForecast:
+    def forecast(self, rows: RateInputs, sample: Rows) -> AnchorForecast:
         """Predict the steps of all anchors, and for the rows `sample` the outputs that `read` reads."""
         predict = fast_forecast.forecast if fast_forecast.fits(rows) else forecast
         return predict(self.context, self.base, rows, sample)
@@ -69,7 +69,7 @@ class CatRateModel:
         return cls(context, torch.tensor(context.shape.base_steps))
 
 
-def forecast(context: CatContext, base: Tensor, rows: Context, sample: Rows) -> AnchorForecast:
+def forecast(context: CatContext, base: Tensor, rows: RateInputs, sample: Rows) -> AnchorForecast:
     """Predict for anchors at places [V,3] in the triplane, the first of `rows`."""
     outputs = context.outputs(rows[0])
     steps = torch.cat(context.read(outputs).steps, dim=1)

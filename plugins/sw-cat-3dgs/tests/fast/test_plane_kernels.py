@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from splatwizard_native import seeded
+from splatwizard_core.base.random_states import seeded
 from sw_cat_3dgs.fast import plane_bits, plane_kernels, plane_sites
 from sw_cat_3dgs.fast.plane_kernels import fit_kernels
 from sw_cat_3dgs.spatial_ar import SpatialAr

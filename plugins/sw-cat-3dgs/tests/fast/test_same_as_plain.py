@@ -97,7 +97,7 @@ def test_bits_of_planes(learn, at_once, monkeypatch):
 
 
 def test_a_graph_holds_no_layer_of_the_planes():
-    """Only derivatives by planes and parameters: layers of 30 values an anchor were gigabytes."""
+    """Only derivatives by planes and parameters: layers of 30 values per anchor were gigabytes."""
     networks, planes = [SpatialAr() for _ in range(3)], [torch.zeros(3, 4, 30, 30, requires_grad=True)]
     kept = []
     with torch.autograd.graph.saved_tensors_hooks(lambda t: kept.append(t.nbytes) or t, lambda t: t):

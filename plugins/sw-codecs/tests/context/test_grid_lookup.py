@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from splatwizard_native import seeded
+from splatwizard_core.base.random_states import seeded
 from sw_codecs.context.fast import grid_lookup
 from sw_codecs.context.fast.grid_lookup import fits
 from sw_codecs.context.hash_grid import HashGrid

@@ -67,7 +67,7 @@ def test_escapes_at_both_ends():
 @pytest.mark.parametrize(
     ("low", "high", "within"),
     [
-        # The lattice of 64 scales x 8 fractions costs 0.003 bit a symbol.
+        # The lattice of 64 scales x 8 fractions costs 0.003 bit per symbol.
         (1.0, 1.5, 0.005),
         (0.2, 20.0, 0.005),
         (15.0, 20.0, 0.005),

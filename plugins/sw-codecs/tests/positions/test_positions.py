@@ -93,7 +93,7 @@ def test_wrong_points_are_refused():
 def test_random_points_cost_what_a_random_set_must():
     n, bits = 20_000, 16
     points = in_order(np.random.default_rng(3).integers(0, 1 << bits, (n, 3)))
-    # log2 of the number of sets of n points out of 2^48: 48 - log2(n!) / n bits a point.
+    # log2 of the number of sets of n points out of 2^48: 48 - log2(n!) / n bits per point.
     ideal = 48 - np.log2(np.arange(1, n + 1)).sum() / n
     assert 8 * len(Octree().encode(points, bits)) / n < 1.02 * ideal
 

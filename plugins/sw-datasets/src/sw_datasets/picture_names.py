@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path, PurePosixPath
+from typing import NoReturn
 
 from splatwizard_core.api import SceneError
 
@@ -30,10 +31,15 @@ def list_pictures(folder: Path) -> list[str]:
     """Names of all pictures below `folder`, relative to it with forward slashes, sorted.
 
     Links are followed, but no folder is entered twice: links in a ring would never end.
+    Raises SceneError for a folder that cannot be read.
     """
+
+    def unreadable(error: OSError) -> NoReturn:
+        raise SceneError(f"{error.filename} cannot be read: {error.strerror}", path=str(folder)) from error
+
     found = []
     entered: set[str] = set()
-    for root, folders, files in os.walk(folder, followlinks=True):
+    for root, folders, files in os.walk(folder, onerror=unreadable, followlinks=True):
         real = os.path.realpath(root)
         if real in entered:
             folders.clear()

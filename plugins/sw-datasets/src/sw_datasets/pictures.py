@@ -154,7 +154,7 @@ def _opened(path: Path, complaint: str) -> Iterator[Image.Image]:
             if picture.width * picture.height > limit:
                 raise SceneError(
                     f"{path}: {picture.width}x{picture.height} px, more than the {limit:,} pixels that are decoded: "
-                    f"set {PIXELS_VARIABLE} to decode larger pictures (each takes about 16 bytes a pixel)",
+                    f"set {PIXELS_VARIABLE} to decode larger pictures (each takes about 16 bytes per pixel)",
                     path=str(path),
                 )
             yield picture

@@ -1,4 +1,4 @@
-"""A process for steps that may take it down, or hang; it reports one JSON line a step."""
+"""A process for steps that may take it down, or hang; it reports one JSON line per step."""
 
 from __future__ import annotations
 

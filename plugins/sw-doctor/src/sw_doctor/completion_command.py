@@ -2,12 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
 import click
 
 from splatwizard_core.tooling import COMPLETION_VARIABLE, debug_option, options
 
+if TYPE_CHECKING:
+    from click.shell_completion import CompletionItem
 
-@click.command(short_help="completion for bash, zsh or fish")
+
+class Completion(click.Command):
+    """The command, which the core also asks for the words of parameters and about options that a command lacks."""
+
+    def items(self, word: Any, context: click.Context, incomplete: str) -> list[CompletionItem]:
+        """Return what TAB offers for a parameter of the type `Word`."""
+        from sw_doctor.words import items
+
+        return items(word.kind, word.paths, context, incomplete)
+
+    def hint(self, error: click.NoSuchOption, arguments: Sequence[str]) -> str | None:
+        """Return what to give in place of an option that there is not; None: no key is called so."""
+        from sw_doctor.unknown_option import set_hint
+
+        return set_hint(error, arguments)
+
+
+@click.command(cls=Completion, short_help="completion for bash, zsh or fish")
 @click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
 @options(debug_option)
 @click.pass_context

@@ -14,8 +14,8 @@ from typing import Any
 from splatwizard_core.api import PluginError
 from splatwizard_core.tooling import Check, Entry, load_plugins
 from sw_doctor import child, compilers, packages, system
-from sw_doctor.cures import cure_of
 from sw_doctor.registered import MAIN_JOB, SECONDS, needs_of, run_registered
+from sw_doctor.remedies import remedy_of
 from sw_doctor.text import OF, SLOWLY, one_line
 
 DIED_IN = {"torch": ("torch", "CUDA"), "rasterizers": ("rasterizers",), MAIN_JOB: ("sw run",)}
@@ -86,7 +86,7 @@ def probed(answer: child.Answer) -> list[Check]:
         needed = not any(check.group == MAIN_JOB for check in checks)
         mend = "sw build-kernels --force" if group == "kernels" else "pip install --force-reinstall torch"
         if OF in step:
-            mend = cure_of(step.partition(OF)[2], how, foreign=True)
+            mend = remedy_of(step.partition(OF)[2], how, foreign=True)
         checks.append(Check(group, step, "broken", f"the process that tried it {how}", mend, needed))
     return checks
 
@@ -108,7 +108,7 @@ def plugin_checks() -> tuple[list[Check], packages.Needs]:
             provided = len(plugins.provided_by(info))
             checks.append(Check("plugins", info.distribution, "ok", f"{info.version}, provides {provided}"))
             continue
-        mend = cure_of(info.distribution, info.error, foreign=info.foreign)
+        mend = remedy_of(info.distribution, info.error, foreign=info.foreign)
         checks.append(Check("plugins", info.distribution, "broken", one_line(f"{info.version}: {info.error}"), mend))
     for info in plugins.plugins:
         for entry, why in plugins.refused_of(info):

@@ -26,8 +26,8 @@ from splatwizard_core.tooling import (
 )
 from splatwizard_native import NativeBuildError, NativeModule
 from sw_doctor.child import Step, serve
-from sw_doctor.cures import cure_of
 from sw_doctor.declared_modules import declared_modules
+from sw_doctor.remedies import remedy_of
 from sw_doctor.text import OF, SLOWLY, one_line
 
 if TYPE_CHECKING:
@@ -199,7 +199,7 @@ def _broken_targets(entries: Iterable[Entry]) -> list[Check]:
         try:
             entry.load()
         except PluginError as error:
-            mend = cure_of(entry.distribution, str(error), foreign=entry.foreign)
+            mend = remedy_of(entry.distribution, str(error), foreign=entry.foreign)
             checks.append(Check("plugins", f"{entry.kind} {entry.name}", "broken", one_line(error), mend))
     return checks
 
@@ -220,7 +220,7 @@ def _check_rasterizer(entry: Entry, plugins: PluginManager) -> Check:
     try:
         info = RasterizerInfo.from_entry(entry)
     except PluginError as error:
-        mend = cure_of(entry.distribution, str(error), foreign=entry.foreign)
+        mend = remedy_of(entry.distribution, str(error), foreign=entry.foreign)
         return Check("rasterizers", entry.name, "broken", one_line(error), mend)
     device = "cpu" if "cpu" in info.devices else "cuda"
     where = ", ".join(sorted(info.devices))
@@ -240,7 +240,7 @@ def _check_rasterizer(entry: Entry, plugins: PluginManager) -> Check:
         rasterizer = NegotiatedRasterizer(plugins, device=device, prefer=[entry.name], forbid=alone)
         _draw(rasterizer, device, backward="BACKWARD" in info.features, axes=2 if "SURFEL" in info.needs else 3)
     except (Exception, SystemExit) as error:
-        mend = cure_of(entry.distribution, str(error), foreign=entry.foreign)
+        mend = remedy_of(entry.distribution, str(error), foreign=entry.foreign)
         return Check("rasterizers", entry.name, "broken", one_line(f"{type(error).__name__}: {error}"), mend)
     return Check("rasterizers", entry.name, "ok", f"drew a test picture on {device} (runs on {where})")
 

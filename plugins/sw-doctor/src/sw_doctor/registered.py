@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from splatwizard_core.tooling import Check, Entry
 from sw_doctor import child
-from sw_doctor.cures import cure_of
+from sw_doctor.remedies import remedy_of
 from sw_doctor.text import one_line
 
 RUNNER = "sw_doctor.child_check"
@@ -38,7 +38,7 @@ def needs_of(entry: Entry) -> set[str]:
 
 def failed(entry: Entry, how: str) -> Check:
     """Finding about a check that failed itself."""
-    mend = cure_of(entry.distribution, how, foreign=entry.foreign)
+    mend = remedy_of(entry.distribution, how, foreign=entry.foreign)
     return Check(_group(entry), entry.name, "broken", f"the check of {entry.distribution} {how}", mend)
 
 

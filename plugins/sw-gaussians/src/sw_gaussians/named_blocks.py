@@ -69,7 +69,8 @@ class Moved(NamedTuple):
     """New key that replaces a key of an older release.
 
     keys        one or several; none: it is gone
-    default     value that the older release had; a key that is gone is refused with another one, if this is not None
+    default     value that the older release had, or a tuple of those without an effect on results: a key that is
+                gone is refused with another one, if this is not None
     provider    whose setting it is, for a key of settings: it is dropped where another is chosen
     """
 
@@ -79,9 +80,14 @@ class Moved(NamedTuple):
 
     def checked(self, old: str, value: Any) -> Any:
         """Return a value of the key `old`. Raises ConfigError if it is gone, and did something."""
-        if not self.keys and self.default is not None and str(value).lower() != str(self.default).lower():
+        harmless = self.default if isinstance(self.default, tuple) else (self.default,)
+        if not self.keys and harmless != (None,) and str(value).lower() not in (str(each).lower() for each in harmless):
             raise ConfigError(f"'{old}' is gone since 0.3, with what {value} did: leave it out", key=old)
         return value
+
+
+SWITCH = (True, False, 1, 0, "yes", "no", "on", "off")
+"""Values of a key that is gone and chose between two ways to the same result."""
 
 
 class Exchangeable(OptimizationParams):

@@ -63,7 +63,7 @@ class PlyGaussians:
 def property_names(sh_rest: int, scales: int = 3) -> list[str]:
     """The vertex properties in the order of the file.
 
-    sh_rest     K - 1, higher SH coefficients a channel
+    sh_rest     K - 1, higher SH coefficients per channel
     scales      of a Gaussian: 3, of a surfel 2
     """
     return [

@@ -87,7 +87,7 @@ def walk(
     for rows in attributes.rows:
         first = predictor.first(geometry.codes[rows])
         _, steps = first.groups["features"]
-        known = first.context.new_empty(len(first.context), sum(channel.slices))
+        known = first.channel_inputs.new_empty(len(first.channel_inputs), sum(channel.slices))
         for i in range(len(channel.slices)):
             columns = channel.part(i)
             mixture = predictor.mixture(i, columns, first, known[:, : columns.start])

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
-from sw_gaussians.named_blocks import Choosing, Moved, OwnCodec
+from sw_gaussians.named_blocks import SWITCH, Choosing, Moved, OwnCodec
 
 from splatwizard_core.api import Params
 from sw_hac.config import FileSettings, HACLearningRates, HACParams, Phases, RateTerm
@@ -68,7 +68,7 @@ class Codec(OwnCodec):
 class HACPlusConfig(Choosing, HACParams):
     """Everything that can be set for HAC++."""
 
-    OLDER: ClassVar[Mapping[str, Moved]] = {"graphs": Moved(())}
+    OLDER: ClassVar[Mapping[str, Moved]] = {"graphs": Moved((), SWITCH)}
     ABSENT: ClassVar[Mapping[str, Any]] = {}
 
     bound_margin: Literal["hac", "extent", "none"] = Field(

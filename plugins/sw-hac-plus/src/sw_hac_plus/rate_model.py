@@ -69,8 +69,8 @@ class HACPlusRateModel(HACRateModel):
             return rates.gaussian_bits(values, mean, scale, steps, p_min=smallest)
         base = self.base_steps[0]
         logit = forecast.outputs[:, sum(self.shape.outputs) :]
-        context = torch.cat([found.means[0] / base, found.scales[0] / base, logit], dim=1)
-        second_mean, second_scale, second_logit = self.channel(values[:, :f] / base, context)
+        inputs = torch.cat([found.means[0] / base, found.scales[0] / base, logit], dim=1)
+        second_mean, second_scale, second_logit = self.channel(values[:, :f] / base, inputs)
         features = further_rates.mixture_bits(
             values[:, :f],
             torch.stack([logit, second_logit], dim=-1),
@@ -95,14 +95,14 @@ class HACPlusRateModel(HACRateModel):
 class FirstPrediction:
     """Prediction of the grid for a block of n anchors: all that is known before the first feature is.
 
-    groups      distributions and steps by group
-    logit       [n,F] of the weight of the grid's Gaussian
-    context     [n,3F] inputs of the channel networks
+    groups          distributions and steps by group
+    logit           [n,F] of the weight of the grid's Gaussian
+    channel_inputs  [n,3F] inputs of the channel networks
     """
 
     groups: BlockPrediction
     logit: Tensor
-    context: Tensor
+    channel_inputs: Tensor
 
 
 class ExactMixtures:
@@ -120,13 +120,15 @@ class ExactMixtures:
         count = sum(self._model.shape.outputs)
         found, logit = self._network.read(outputs[:, :count]), outputs[:, count:]
         features = found["features"]
-        context = torch.cat([torch.as_tensor(features.mean), torch.as_tensor(features.scale), logit], dim=1)
+        inputs = torch.cat([torch.as_tensor(features.mean), torch.as_tensor(features.scale), logit], dim=1)
         groups = {group: (each, self._network.steps(group, each)) for group, each in found.items()}
-        return FirstPrediction(groups, logit, context)
+        return FirstPrediction(groups, logit, inputs)
 
     def mixture(self, index: int, columns: slice, first: FirstPrediction, known: Tensor) -> RowMixture:
         """Return the mixtures of slice `index`, its `columns`, once the features [n,i] before it are `known`."""
-        mean, scale, logit = _second(self._channel, index, known, first.context, self._width(index), MAX_EXACT_NUMBERS)
+        mean, scale, logit = _second(
+            self._channel, index, known, first.channel_inputs, self._width(index), MAX_EXACT_NUMBERS
+        )
         grid, _ = first.groups["features"]
         return RowMixture(
             grid.mean[:, columns], grid.scale[:, columns], mean, scale, first.logit[:, columns] - logit, grid.step
@@ -148,15 +150,15 @@ class FloatMixtures:
         outputs = float_outputs(self._model, codes)
         found, base = self._model.read(outputs), self._model.base_steps[0]
         logit = outputs[:, sum(self._model.shape.outputs) :]
-        context = torch.cat([found.means[0] / base, found.scales[0] / base, logit], dim=1)
+        inputs = torch.cat([found.means[0] / base, found.scales[0] / base, logit], dim=1)
         groups = float_prediction(found)
-        return FirstPrediction(groups, logit, context)
+        return FirstPrediction(groups, logit, inputs)
 
     def mixture(self, index: int, columns: slice, first: FirstPrediction, known: Tensor) -> RowMixture:
         """Return the mixtures of slice `index`, its `columns`, once the features [n,i] before it are `known`."""
         with one_thread():
             width = self._channel.width(index)
-            mean, scale, logit = _second(self._channel, index, known, first.context, width, MAX_FLOAT_NUMBERS)
+            mean, scale, logit = _second(self._channel, index, known, first.channel_inputs, width, MAX_FLOAT_NUMBERS)
         (grid, _), base = first.groups["features"], self._model.base_steps[0]
         return RowMixture(
             grid.mean[:, columns], grid.scale[:, columns], (base * mean).clamp(-1e6, 1e6),
@@ -172,13 +174,13 @@ Predictor = GridPredictor | ExactMixtures | FloatMixtures
 
 
 def _second(
-    channel: ChannelMixture | ExactChannelMixture, index: int, known: Tensor, context: Tensor, width: int, numbers: int
+    channel: ChannelMixture | ExactChannelMixture, index: int, known: Tensor, inputs: Tensor, width: int, numbers: int
 ) -> tuple[Tensor, ...]:
     """Means, scales and logits of slice `index`; of as many rows at once as `width` leaves room for in `numbers`."""
 
     def part(rows: Tensor) -> Tensor:
         at = slice(int(rows[0]), int(rows[-1]) + 1) if len(rows) else slice(0)
-        return channel.slice(index, known[at], context[at])
+        return channel.slice(index, known[at], inputs[at])
 
     outputs = by_parts(part, torch.arange(len(known)), width, numbers)
     return outputs.chunk(PARTS, dim=1)

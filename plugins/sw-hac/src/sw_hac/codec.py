@@ -78,16 +78,16 @@ def decode(reader: ContainerReader, plugins: PluginManager) -> DecodedAnchors:
     mlp_grid = two_layers(grid.width, header.grid_hidden, sum(shape.outputs), torch.Generator())
     read_networks(reader, {**{name: getattr(model, name) for name in model.NETWORKS}, "mlp_grid": mlp_grid})
     with reader.decoding("networks"):
-        predict = HACRateModel.of_file(grid, mlp_grid, shape, header.base_steps).predictor(header.mode)
+        predictor = HACRateModel.of_file(grid, mlp_grid, shape, header.base_steps).predictor(header.mode)
     attributes = AttributeDecoder(reader, model, list(SECTIONS.values()), header.mode, plugins)
-    walk(attributes, predict, geometry)
+    walk(attributes, predictor, geometry)
     attributes.finish()
     return model
 
 
 @dataclass(frozen=True)
 class HACHeader:
-    """Header values of a file: coder mode, base steps, sizes of anchors and networks; `grid_features` bits a vertex."""
+    """Header values of a file: coder mode, base steps, sizes of anchors, networks; `grid_features` bits per vertex."""
 
     mode: Mode
     base_steps: tuple[float, float, float]
@@ -158,17 +158,17 @@ def read_grid(reader: ContainerReader, features: int, plugins: PluginManager) ->
 
 def walk(
     attributes: AttributeCoder,
-    predict: Predictor,
+    predictor: Predictor,
     geometry: AnchorGeometry,
     sections: Mapping[str, str] = SECTIONS,
 ) -> None:
     """Code all groups of each block of anchors: encoder and decoder go over them in this order.
 
-    predict     gives distributions and steps from the position codes of a block
+    predictor   gives distributions and steps from the position codes of a block
     sections    section of each group
     """
     for rows in attributes.rows:
-        code_groups(attributes, predict(geometry.codes[rows]), geometry.masks[rows], rows, sections)
+        code_groups(attributes, predictor(geometry.codes[rows]), geometry.masks[rows], rows, sections)
 
 
 def code_groups(

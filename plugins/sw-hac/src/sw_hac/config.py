@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 from sw_anchors.lattice import Margin
 from sw_anchors.params import CodedAnchorLearningRates, CodedAnchorParams
-from sw_gaussians.named_blocks import Choosing, Moved, OwnCodec
+from sw_gaussians.named_blocks import SWITCH, Choosing, Moved, OwnCodec
 
 from splatwizard_core.api import Params
 
@@ -129,6 +129,6 @@ class HACConfig(Choosing, HACParams):
 
     OLDER: ClassVar[Mapping[str, Moved]] = {
         f"codec.{name}": Moved((f"codec.settings.{name}",)) for name in FileSettings.model_fields
-    } | {"graphs": Moved(())}
+    } | {"graphs": Moved((), SWITCH)}
 
     codec: Codec = Field(Codec(), description="what writes the file")

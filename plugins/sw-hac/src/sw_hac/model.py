@@ -11,7 +11,7 @@ import torch
 from sw_anchors.anchors import linear_layers
 from sw_anchors.coded_anchors import CodedAnchors
 from sw_anchors.lattice import TOP
-from sw_anchors.rate_model import Context
+from sw_anchors.rate_model import RateInputs
 from torch import Tensor, nn
 
 from splatwizard_core.api import SceneError
@@ -93,7 +93,7 @@ class HACAnchors(CodedAnchors):
         """Return the networks that the file holds, by name, in its order."""
         return {name: getattr(self, name) for name in (*self.NETWORKS, "mlp_grid")}
 
-    def context_rows(self) -> Context:
+    def context_rows(self) -> RateInputs:
         """Return the places [N,3] of the anchors in the cube of the grid, 0..1, as their 16-bit codes give them."""
         codes = self.codes()
         if self._places is None or self._places[0] is not codes:

@@ -20,10 +20,10 @@ from sw_anchors.float_mode import Mode, one_thread
 from sw_anchors.lattice import TOP
 from sw_anchors.rate_model import (
     PUBLISHED_FLOORS,
-    AnchorContext,
+    AnchorDistributions,
     AnchorForecast,
-    Context,
     Floors,
+    RateInputs,
     Rows,
     gaussian_rate,
     triple,
@@ -77,15 +77,15 @@ class HACRateModel:
         """Number of outputs before the step logits: a mean and a deviation for each number of an anchor."""
         return sum(self.shape.outputs[:-1])
 
-    def forecast(self, context: Context, sample: Rows) -> AnchorForecast:
+    def forecast(self, inputs: RateInputs, sample: Rows) -> AnchorForecast:
         """Predict the steps of all anchors at places [V,3], and for the rows `sample` the outputs that `rate` reads.
 
         `own_bits` of the forecast are those of the grid.
         """
-        (places,) = context
+        (places,) = inputs
         features, bits = self.grid.with_bits(places)
-        predict = fast_outputs.steps_and_outputs if fast_outputs.fits(features) else steps_and_outputs
-        steps, sample_steps, outputs = predict(features, self.network, self.base, sample, self.distributions)
+        compute = fast_outputs.steps_and_outputs if fast_outputs.fits(features) else steps_and_outputs
+        steps, sample_steps, outputs = compute(features, self.network, self.base, sample, self.distributions)
         return AnchorForecast(steps, sample_steps, outputs, bits)
 
     def rate(self, values: Tensor, forecast: AnchorForecast, masks: Tensor, counted: Tensor) -> tuple[Tensor, Tensor]:
@@ -105,12 +105,12 @@ class HACRateModel:
         mean, scale = torch.cat(found.means, dim=1), torch.cat(found.scales, dim=1)
         return gaussian_rate(values, mean, scale, forecast.sample_steps, masks, counted, self.floors)
 
-    def read(self, outputs: Tensor) -> AnchorContext:
+    def read(self, outputs: Tensor) -> AnchorDistributions:
         """Read outputs [V,W] of the network as means and deviations [V,C] and steps [V,1] of each group."""
         outputs = outputs if self.units is None else outputs * self.units
         parts = torch.split(outputs[:, : sum(self.shape.outputs)], self.shape.outputs, dim=1)
         steps = steps_of(parts[6], self.base)
-        return AnchorContext(triple(parts[0:6:2]), triple(parts[1:6:2]), triple(steps.split(1, dim=1)))
+        return AnchorDistributions(triple(parts[0:6:2]), triple(parts[1:6:2]), triple(steps.split(1, dim=1)))
 
     # File
 
@@ -166,7 +166,9 @@ class ExactPredictor:
     def __call__(self, codes: Tensor) -> BlockPrediction:
         """Predict for anchors at position codes [n,3] on the lattice; means and deviations in base steps."""
         found = self._network.on_lattice(codes, self._model.short_features, self._model.row_width)
-        return {group: (context, self._network.steps(group, context)) for group, context in found.items()}
+        return {
+            group: (distributions, self._network.steps(group, distributions)) for group, distributions in found.items()
+        }
 
 
 class FloatPredictor:
@@ -192,7 +194,7 @@ def float_outputs(model: HACRateModel, codes: Tensor) -> Tensor:
         )
 
 
-def float_prediction(found: AnchorContext) -> dict[str, tuple[RowContext | RowLattice, Tensor]]:
+def float_prediction(found: AnchorDistributions) -> dict[str, tuple[RowContext | RowLattice, Tensor]]:
     """Return distributions as `conditional-gaussian` takes them in mode `float`; deviations are at least 1e-9."""
     return {
         group: (RowContext(mean.clamp(-1e6, 1e6), scale.clamp(1e-9, 1e6), step.double()), step.double())

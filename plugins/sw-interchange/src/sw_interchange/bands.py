@@ -8,4 +8,4 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float32]
 
 COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15, 4: 24}
-"""SH degree -> coefficients a channel above band 0."""
+"""SH degree -> coefficients per channel above band 0."""

@@ -152,13 +152,13 @@ class SogCodec(FormatCodec):
 
 
 class SplatCodec(FormatCodec):
-    """.splat of antimatter15: 32 bytes a Gaussian, float32 positions and scales, one colour."""
+    """.splat of antimatter15: 32 bytes per Gaussian, float32 positions and scales, one colour."""
 
     FORMAT = "splat"
     MAX_DEGREE = 0
 
 
 class CompressedPlyCodec(FormatCodec):
-    """Compressed .ply of PlayCanvas: 16 bytes a Gaussian in chunks of 256, and 8-bit spherical harmonics."""
+    """Compressed .ply of PlayCanvas: 16 bytes per Gaussian in chunks of 256, and 8-bit spherical harmonics."""
 
     FORMAT = "compressed-ply"

@@ -54,7 +54,7 @@ class Format:
 
 _FORMATS = (
     Format("ply", ".ply", "3DGS .ply in all its dialects, float32", 4, reader="ply:read_ply", writer="ply:write_ply"),
-    Format("splat", ".splat", "32 bytes a Gaussian, no SH", 0, reader="splat:read_splat", writer="splat:write_splat",
+    Format("splat", ".splat", "32 bytes per Gaussian, no SH", 0, reader="splat:read_splat", writer="splat:write_splat",
            options="splat:SplatOptions"),
     Format("spz", ".spz", "quantised and compressed, SH included (Niantic)", 4, reader="spz:read_spz",
            writer="spz:write_spz", options="spz:SpzOptions"),

@@ -6,7 +6,7 @@ from splatwizard_core.api import Registry, hookimpl
 @hookimpl
 def register_exporters(registry: Registry) -> None:
     registry.add("splat", "sw_interchange.registered:export_splat", suffix=".splat",
-                 summary=".splat: 32 bytes a Gaussian, no SH")  # fmt: skip
+                 summary=".splat: 32 bytes per Gaussian, no SH")  # fmt: skip
     registry.add("spz", "sw_interchange.registered:export_spz", suffix=".spz",
                  summary=".spz of Niantic, version 3: quantised, gzip")  # fmt: skip
     registry.add("spz-v4", "sw_interchange.registered:export_spz4", suffix="",
@@ -24,7 +24,7 @@ def register_exporters(registry: Registry) -> None:
 @hookimpl
 def register_importers(registry: Registry) -> None:
     registry.add("splat", "sw_interchange.registered:import_splat", suffix=".splat",
-                 summary=".splat: 32 bytes a Gaussian, no SH")  # fmt: skip
+                 summary=".splat: 32 bytes per Gaussian, no SH")  # fmt: skip
     registry.add("spz", "sw_interchange.registered:import_spz", suffix=".spz",
                  summary=".spz of Niantic, versions 1 to 4")  # fmt: skip
     registry.add("compressed-ply", "sw_interchange.registered:import_compressed_ply", suffix=".compressed.ply",

@@ -49,7 +49,7 @@ class Limits:
 
 
 def decoded_bytes(count: int, coefficients: int) -> int:
-    """Bytes of Gaussians as float32, with so many SH coefficients a channel besides that of band 0."""
+    """Bytes of Gaussians as float32, with so many SH coefficients per channel besides that of band 0."""
     return count * (56 + 12 * coefficients)
 
 

@@ -30,7 +30,7 @@ MAX_PALETTE = 1 << 16
 PALETTE_COLUMNS = 64
 """Entries of the SH palette side by side in its image."""
 BANDS = {1: 3, 2: 8, 3: 15}
-"""SH degree -> coefficients a channel."""
+"""SH degree -> coefficients per channel."""
 LARGEST_LOGARITHM = 80
 """Of ln(1 + |x|) of a coordinate."""
 

@@ -1,4 +1,4 @@
-"""The .splat format: 32 bytes a Gaussian and no header, colours of SH band 0 alone.
+"""The .splat format: 32 bytes per Gaussian and no header, colours of SH band 0 alone.
 
 Source: the public description of antimatter15/splat.
 """

@@ -148,7 +148,7 @@ class ReferenceRasterizer:
 
     @staticmethod
     def _depth_channels(p: Projection, opt: RasterOptions) -> dict[str, Tensor]:
-        """Depth maps that are sums of one value a splat, [V,1] each."""
+        """Depth maps that are sums of one value per splat, [V,1] each."""
         channels = {}
         if opt.depth & {"accumulated", "expected"}:
             channels["accumulated"] = p.depth[:, None]

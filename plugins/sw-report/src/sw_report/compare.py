@@ -69,12 +69,12 @@ def compare(
 
 
 def _beside_published(folders: tuple[Path, ...], own: bool, as_json: bool) -> None:
-    from sw_report.beside_tables import beside_tables, to_dict
     from sw_report.printed import print_tables
+    from sw_report.published_tables import published_tables, to_dict
     from sw_report.runs import collect
 
     collection = collect(folders)
-    tables = beside_tables(collection.runs, others=not own)
+    tables = published_tables(collection.runs, others=not own)
 
     def told(facts: dict[str, Any]) -> None:
         print_tables([(table.title, table.drawn()) for table in tables], facts["notes"])

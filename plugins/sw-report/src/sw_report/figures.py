@@ -15,7 +15,7 @@ from sw_report import numbers
 from sw_report.aggregate import DatasetTable, dataset_tables
 from sw_report.charts import STYLES
 from sw_report.distortion import drawn_metrics
-from sw_report.looks import looks_of
+from sw_report.method_styles import styles_of
 from sw_report.plots import counts_anchors
 from sw_report.rd_file import themes
 from sw_report.runs import Run
@@ -35,7 +35,7 @@ class Line:
 
     name: str
     points: list[tuple[float, float, float | None]]
-    look: int
+    style: int
     dashed: bool = False
 
 
@@ -53,12 +53,12 @@ def write_figures(runs: Sequence[Run], folder: Path) -> list[Path]:
     Nothing is written where no metric has a value. Raises UserInputError without matplotlib; returns the files.
     """
     _check_matplotlib()
-    looks = looks_of(runs)
+    styles = styles_of(runs)
     drawings: dict[str, list[Panel]] = {}
     for place in dict.fromkeys(run.place for run in runs):
-        drawings[_free(drawings, place[0])] = _of_scene([run for run in runs if run.place == place], looks)
+        drawings[_free(drawings, place[0])] = _of_scene([run for run in runs if run.place == place], styles)
     for table in dataset_tables(runs):
-        drawings[_free(drawings, table.dataset)] = _of_means(table, runs, looks)
+        drawings[_free(drawings, table.dataset)] = _of_means(table, runs, styles)
     folder.mkdir(parents=True, exist_ok=True)
     return [
         write_panels(panels, folder / f"rd-{name}.{form}")
@@ -106,20 +106,20 @@ def _free(taken: dict[str, list[Panel]], title: str) -> str:
     return f"{name}@{same + 1}" if same else name
 
 
-def _of_scene(runs: Sequence[Run], looks: dict[str, int]) -> list[Panel]:
+def _of_scene(runs: Sequence[Run], styles: dict[str, int]) -> list[Panel]:
     panels = []
     for metric in drawn_metrics(runs):
         lines = []
         for variant in dict.fromkeys(run.variant for run in runs):
             own = [run for run in runs if run.variant == variant]
             points = [(r.size / 1e6, v, r.deviation(metric)) for r in own if (v := r.mean(metric)) is not None]
-            lines.append(Line(variant, sorted(points, key=lambda p: p[:2]), looks[variant],
+            lines.append(Line(variant, sorted(points, key=lambda p: p[:2]), styles[variant],
                               any(map(counts_anchors, own))))  # fmt: skip
         panels.append(Panel(numbers.heading(metric), [line for line in lines if line.points]))
     return panels
 
 
-def _of_means(table: DatasetTable, runs: Sequence[Run], looks: dict[str, int]) -> list[Panel]:
+def _of_means(table: DatasetTable, runs: Sequence[Run], styles: dict[str, int]) -> list[Panel]:
     panels = []
     of_table = [run for run in runs if run.facts.dataset == table.dataset]
     for metric in drawn_metrics(of_table):
@@ -130,7 +130,7 @@ def _of_means(table: DatasetTable, runs: Sequence[Run], looks: dict[str, int]) -
                 if row.variant == variant and row.size is not None and (value := row.metrics.get(metric)) is not None
             ]  # fmt: skip
             dashed = any(counts_anchors(run) for run in of_table if run.variant == variant)
-            lines.append(Line(variant, sorted(points, key=lambda p: p[:2]), looks[variant], dashed))
+            lines.append(Line(variant, sorted(points, key=lambda p: p[:2]), styles[variant], dashed))
         lines = [line for line in lines if line.points]
         if lines:
             panels.append(Panel(numbers.heading(metric), lines))
@@ -145,9 +145,9 @@ def _draw(figure: Figure, panels: Sequence[Panel]) -> None:
     for panel, axes in zip(panels, figure.subplots(1, len(panels), squeeze=False)[0], strict=True):
         for line in panel.lines:
             x, y, deviations = zip(*line.points, strict=True)
-            marker = MARKERS[(line.look + line.look // STYLES) % len(MARKERS)]
+            marker = MARKERS[(line.style + line.style // STYLES) % len(MARKERS)]
             style: dict[str, Any] = {
-                "color": colours[line.look % STYLES], "marker": marker,
+                "color": colours[line.style % STYLES], "marker": marker,
                 "markersize": 4.5, "linewidth": 1.3, "linestyle": "--" if line.dashed else "-",
             }  # fmt: skip
             (handles[line.name],) = axes.plot(x, y, **style)

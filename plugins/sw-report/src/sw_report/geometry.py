@@ -28,7 +28,7 @@ def geometry_parts(run: Run, *, pictures: bool) -> list[Part]:
 
 
 def _values_table(geometry: Mapping[str, Mapping[str, Any]]) -> Table:
-    """One row a value; what a mesh was made with goes into a note."""
+    """One row per value; what a mesh was made with goes into a note."""
     rows: list[Row] = []
     notes = []
     for metric, details in geometry.items():

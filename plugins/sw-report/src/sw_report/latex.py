@@ -65,7 +65,7 @@ def to_latex(tables: Sequence[tuple[str, Table]], notes: Sequence[str], runs: Se
 
 
 def methods_by_datasets(runs: Sequence[Run]) -> str:
-    """One row a method and rate point, one group of columns a data set (of one scene: that scene); "" for one group.
+    """One row per method and rate point, a group of columns per data set (of one scene: that scene); "" for one group.
 
     Each group has PSNR, SSIM, one LPIPS where they are known, and MB. A scene that a method lacks leaves dashes.
     """

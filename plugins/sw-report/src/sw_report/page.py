@@ -26,7 +26,7 @@ from sw_report.distortion import bd_tables, choose_anchor, with_values
 from sw_report.dtu_table import dtu_table
 from sw_report.facts import RunFacts
 from sw_report.geometry import geometry_parts
-from sw_report.looks import looks_of
+from sw_report.method_styles import styles_of
 from sw_report.pictures import (
     GAIN,
     LONGEST_SIDE,
@@ -184,7 +184,7 @@ def _single_sections(run: Run, options: PageOptions) -> list[Section]:
     if options.pictures:
         gallery = single_gallery(run, Truth([run], options.opener), PictureBudget())
         sections.append(Section("pictures", PICTURES, [Part(gallery=gallery)], short=SHORT[PICTURES]))
-    views = plots.view_charts([run], looks_of([run]))
+    views = plots.view_charts([run], styles_of([run]))
     parts = [Part(charts=views)] if views is not None else [Part(text="The record holds no scores of single views.")]
     table = plots.views_table([run])
     parts += [Part(table=table, folded="All scores")] if table is not None else []
@@ -212,7 +212,7 @@ def _of_training_views(facts: RunFacts) -> str:
 
 def _many_sections(runs: Sequence[Run], options: PageOptions) -> list[Section]:
     """Results, curves, pictures; then BD values; then the rest."""
-    style_of = looks_of(runs)
+    style_of = styles_of(runs)
     sections = []
     means = dataset_tables(runs, partial=options.partial)
     if means:
@@ -306,7 +306,7 @@ def _rest(runs: Sequence[Run], style_of: dict[str, int]) -> list[Part]:
 
 
 def _training(anchor: str, title: str, runs: Sequence[Run], breakdown: Table | None) -> Section:
-    style_of = looks_of(runs)
+    style_of = styles_of(runs)
     curves, missing = plots.training_charts(runs, style_of)
     parts = [Part(charts=curves, text=_sentence(missing))]
     if breakdown is not None:

@@ -34,7 +34,7 @@ def counts_anchors(run: Run) -> bool:
 
 
 def distortion_charts(runs: Sequence[Run], style_of: dict[str, int]) -> Charts | None:
-    """Quality against bytes, one chart a metric, one line a method."""
+    """Quality against bytes, one chart per metric, one line per method."""
     variants = variants_of(runs)
     figures = []
     for metric in drawn_metrics(runs):
@@ -256,18 +256,20 @@ def _training_figures(drawn: Sequence[Drawn]) -> list[Figure]:
 def view_charts(runs: Sequence[Run], style_of: dict[str, int]) -> Charts | None:
     """First two metrics (PSNR and SSIM) of every test view; views in the order of the record."""
     shown = pick_evenly(runs, MOST_LINES)
-    looks = [(style_of[r.variant], sum(r.variant == other.variant for other in shown[:i])) for i, r in enumerate(shown)]
+    styles = [
+        (style_of[r.variant], sum(r.variant == other.variant for other in shown[:i])) for i, r in enumerate(shown)
+    ]
     figures = []
     for metric in drawn_metrics(shown)[:2]:
         lines = []
-        for run, (look, dash) in zip(shown, looks, strict=True):
+        for run, (style, dash) in zip(shown, styles, strict=True):
             scores = run.facts.metrics[metric].per_view if metric in run.facts.metrics else []
             points = [
                 Point(float(j + 1), value, f"{run.label}, {name}: {numbers.score(metric, value, digits=3)}")
                 for j, (name, value) in enumerate(zip(run.facts.views, scores, strict=False))
                 if value is not None
             ]
-            lines.append(Series(run.label, points, look, joined=len(shown) > 1, dash=dash))
+            lines.append(Series(run.label, points, style, joined=len(shown) > 1, dash=dash))
         if not any(line.points for line in lines):
             continue
         average = shown[0].mean(metric) if len(shown) == 1 else None
@@ -277,7 +279,7 @@ def view_charts(runs: Sequence[Run], style_of: dict[str, int]) -> Charts | None:
         figures.append(Figure(_caption(style), chart.draw()))
     if not figures:
         return None
-    keys = [swatch(look, dash=dash) for look, dash in looks]
+    keys = [swatch(style, dash=dash) for style, dash in styles]
     legend = [(key, run.label) for key, run in zip(keys, shown, strict=True)] if len(shown) > 1 else []
     notes = [f"{len(shown)} of {len(runs)} runs, spread evenly."] if len(shown) < len(runs) else []
     return Charts(figures, legend, notes)

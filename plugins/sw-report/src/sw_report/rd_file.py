@@ -9,7 +9,7 @@ from importlib import resources
 from markupsafe import Markup
 
 from sw_report.charts import HEIGHT, STYLES, WIDTH
-from sw_report.looks import looks_of
+from sw_report.method_styles import styles_of
 from sw_report.plots import distortion_charts
 from sw_report.runs import Run
 
@@ -32,11 +32,11 @@ text { fill: var(--muted); font: 11.5px ui-sans-serif, system-ui, "Segoe UI", Ro
 
 
 def rd_svg(runs: Sequence[Run], title: str) -> str | None:
-    """Quality against bytes, one chart a metric beside the other, one line a method; None if there is nothing to draw.
+    """Quality against bytes, one chart per metric beside the other, one line per method; None if nothing can be drawn.
 
     runs    of one scene under one protocol
     """
-    charts = distortion_charts(runs, looks_of(runs))
+    charts = distortion_charts(runs, styles_of(runs))
     if charts is None:
         return None
     width = 2 * MARGIN + len(charts.figures) * (WIDTH + GAP) - GAP

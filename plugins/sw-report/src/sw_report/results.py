@@ -43,7 +43,7 @@ def print_results(done: Sequence[tuple[Record, Path]], written: Sequence[Path], 
 
 
 def print_table(records: Sequence[Record], out: Console) -> None:
-    """Print one row a run, the rows of a method together; the best value of a column is marked if there is a choice.
+    """Print one row per run, the rows of a method together; the best value of a column is marked if there is a choice.
 
     Columns that do not fit are left out, and named.
     """

@@ -13,7 +13,7 @@ from splatwizard_core.tooling import FILE_NAME
 from sw_report.configurations import PRESET, configurations, described, differing, seed_of
 from sw_report.declared import method_title, rate_position
 from sw_report.facts import RunFacts, clean, read_facts
-from sw_report.sweeps import sweep_notes
+from sw_report.sweeps import is_sweep, sweep_notes
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +110,9 @@ def collect(paths: Sequence[Path]) -> Collection:
             found.setdefault(record.resolve(), (record, root))
     if not found:
         where = ", ".join(map(str, paths))
-        raise UserInputError(f"no {FILE_NAME} under {where}: `sw run --out {paths[0]}` makes them")
+        sweeps = [root for root in paths if is_sweep(root)]
+        how = f"`sw bench` goes on with the sweep in {sweeps[0]}" if sweeps else f"`sw run --out {paths[0]}` makes them"
+        raise UserInputError(f"no {FILE_NAME} under {where}: {how}")
     runs: list[Run] = []
     remarked: dict[str, list[str]] = {}
     problems: list[UserInputError] = []

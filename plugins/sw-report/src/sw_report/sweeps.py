@@ -22,6 +22,11 @@ Row = tuple[str, str, str, str, str, str, str]
 """label, scene, seed, rate, directory below the folder, status, reason."""
 
 
+def is_sweep(root: Path) -> bool:
+    """Whether `sw bench` has begun a sweep in a folder."""
+    return (root / FILE_NAME).is_file()
+
+
 def sweep_notes(root: Path, records: Collection[Path]) -> list[str]:
     """Return a line for each failed run of the sweep in a folder, and lines about what it lacks and has besides.
 

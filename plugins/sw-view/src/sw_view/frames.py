@@ -1,4 +1,4 @@
-"""Frames of a viewer: the camera of a visitor, how many pixels are drawn while it moves, and two pictures in one."""
+"""Frames of a viewer: the camera of a session, how many pixels are drawn while it moves, and two pictures in one."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def frame_size(width: int, height: int, share: float) -> tuple[int, int]:
 
 
 def camera_at(wxyz: ArrayLike, position: ArrayLike, fov_y: float, size: tuple[int, int], near: float = 0.2) -> Camera:
-    """Return the camera of a visitor.
+    """Return the camera of a session.
 
     wxyz        [4] camera -> world, OpenCV axes
     position    [3] world units

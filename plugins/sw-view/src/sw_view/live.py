@@ -12,10 +12,10 @@ import torch
 from splatwizard_core.api import Camera, RasterOptions, SplatModel
 from splatwizard_core.tooling import NegotiatedRasterizer, StartedTraining, say
 from sw_view.drawing import Drawing
-from sw_view.exhibits import Exhibit
-from sw_view.looks import look
+from sw_view.mode_pictures import mode_picture
 from sw_view.shown_cameras import surroundings_of
 from sw_view.shown_gaussians import shown_gaussians
+from sw_view.shown_models import ShownModel
 from sw_view.viewer import Viewer, start_server
 
 if TYPE_CHECKING:
@@ -39,7 +39,10 @@ class LiveView:
         self._model: SplatModel | None = None
         self._shown_at = self._rests_until = 0.0
         self._viewer = Viewer(
-            start_server(HOST, port), surroundings_of(training.scene), [training.method], lambda _label: self.exhibit
+            start_server(HOST, port),
+            surroundings_of(training.scene),
+            [training.method],
+            lambda _label: self.shown_model,
         )
         self._paused = self._viewer.server.gui.add_checkbox("Pause the training", initial_value=False)
         self._paused.on_update(lambda _event: self._viewer.wake())
@@ -70,9 +73,9 @@ class LiveView:
         self._viewer.stop()
 
     @property
-    def exhibit(self) -> Exhibit:
+    def shown_model(self) -> ShownModel:
         """The model of the last step, drawn as it would be after the training."""
-        return Exhibit(self._draw, lambda camera: self._as_decoded(shown_gaussians, camera), lambda: "")
+        return ShownModel(self._draw, lambda camera: self._as_decoded(shown_gaussians, camera), lambda: "")
 
     def _draw(self, camera: Camera, mode: str) -> Pixels:
         model, rasterizer = self._model, self._training.rasterizer
@@ -81,7 +84,7 @@ class LiveView:
         options = RasterOptions(background=self._training.scene.background.to(model.device))
         drawing = Drawing(model, self._training.scene, rasterizer, options, model.device)
         with _as_found(model):
-            return look(drawing, camera, mode)
+            return mode_picture(drawing, camera, mode)
 
     def _as_decoded(self, call: Callable[..., Any], camera: Camera) -> Any:
         assert self._model is not None

@@ -21,7 +21,7 @@ FRAMES, FPS = 120, 30.0
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Cameras to be drawn one after the other, all of one size, and the frames a second that they are meant for."""
+    """Cameras to be drawn one after the other, all of one size, and the frames per second that they are meant for."""
 
     cameras: list[Camera]
     fps: float

@@ -64,7 +64,7 @@ def video_file(path: Path, size: tuple[int, int], fps: float) -> Iterator[VideoW
     """Write a video; it takes the place of `path` when the block ends, and is gone if the block raises.
 
     size    width, height of each frame, even numbers of pixels
-    fps     frames a second
+    fps     frames per second
     """
     library = video_library()
     form, encoder, options = FORMS[path.suffix.lower()]

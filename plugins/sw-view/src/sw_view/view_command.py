@@ -81,19 +81,19 @@ def view(
         print_facts(facts, as_json, f"{facts['bytes']:,} bytes: {page}")
         return
 
-    from sw_view.exhibits import Exhibit, exhibit
-    from sw_view.looks import PICTURE
+    from sw_view.mode_pictures import PICTURE
+    from sw_view.shown_models import ShownModel, shown_model
     from sw_view.viewer import Viewer, start_server, stop_server
 
     server = start_server(host, port)
     try:
         first = open_entry(next(iter(entries.values())), chosen, plugins)
-        shown = exhibit(first)
+        shown = shown_model(first)
         shown.draw(first.around.cameras[0].camera, PICTURE)  # loads or compiles the kernels: no browser waits for that
         red, green, blue = first.drawing.scene.background.tolist()
 
-        def open_label(label: str) -> Exhibit:
-            return shown if label == first.entry.label else exhibit(open_entry(entries[label], chosen, plugins))
+        def open_label(label: str) -> ShownModel:
+            return shown if label == first.entry.label else shown_model(open_entry(entries[label], chosen, plugins))
 
         viewer = Viewer(server, first.around, list(entries), open_label, (red, green, blue))
         if as_json:

@@ -17,11 +17,11 @@ import numpy as np
 
 from splatwizard_core.api import Camera, CapabilityError
 from splatwizard_core.tooling import ForeseenError
-from sw_view.exhibits import Exhibit
+from sw_view.browser_session import ELLIPSOIDS, NOTHING, SPLATS, BrowserSession
 from sw_view.frames import REST, Pixels, orientation_of, side_by_side
 from sw_view.shown_cameras import Surroundings
 from sw_view.shown_gaussians import ShownGaussians, sphere
-from sw_view.visitor import ELLIPSOIDS, NOTHING, SPLATS, Visitor
+from sw_view.shown_models import ShownModel
 
 if TYPE_CHECKING:
     import viser
@@ -51,23 +51,23 @@ def stop_server(server: viser.ViserServer) -> None:
 
 
 class Viewer:
-    """Shows exhibits to all browsers that connect.
+    """Shows models to all browsers that connect.
 
     server      of `start_server`
     around      cameras and the direction that is up
-    labels      of the exhibits; the first is what a browser sees at first
-    open_label  (label) -> the exhibit, called when somebody first looks at it
+    labels      of the models; the first is what a browser sees at first
+    open_label  (label) -> the model, called when somebody first looks at it
     background  [3] in 0..1, behind what the browser draws by itself
     """
 
     def __init__(
         self, server: viser.ViserServer, around: Surroundings, labels: Sequence[str],
-        open_label: Callable[[str], Exhibit], background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        open_label: Callable[[str], ShownModel], background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:  # fmt: skip
         self.server, self._around, self._labels, self._open = server, around, tuple(labels), open_label
         self._ground = np.round(255 * np.array(background)).astype(np.uint8)
-        self._exhibits: dict[str, Exhibit] = {}
-        self._visitors: dict[int, Visitor] = {}
+        self._shown_models: dict[str, ShownModel] = {}
+        self._sessions: dict[int, BrowserSession] = {}
         self._awake = threading.Condition()
         self._woken = False
         self.generation = 0
@@ -95,7 +95,7 @@ class Viewer:
     @property
     def watched(self) -> bool:
         """Whether a browser is connected."""
-        return bool(self._visitors)
+        return bool(self._sessions)
 
     def pump(self, wait: float) -> None:
         """Draw what browsers wait for; sleep up to `wait` seconds while there is nothing to draw."""
@@ -103,12 +103,12 @@ class Viewer:
         while True:
             with self._awake:
                 self._woken = False
-            for visitor in list(self._visitors.values()):
-                key = visitor.due(self.generation, time.monotonic())
+            for session in list(self._sessions.values()):
+                key = session.due(self.generation, time.monotonic())
                 if key is not None:
-                    self._serve(visitor, key)
+                    self._serve(session, key)
             now = time.monotonic()
-            resting = [v.moved_at + REST for v in list(self._visitors.values()) if v.drawn[2] < 1]
+            resting = [v.moved_at + REST for v in list(self._sessions.values()) if v.drawn[2] < 1]
             upto = min([until, *resting])
             with self._awake:
                 if not self._woken and upto > now:
@@ -130,80 +130,80 @@ class Viewer:
             self._awake.notify_all()
 
     def _enter(self, client: viser.ClientHandle) -> None:
-        self._visitors[client.client_id] = Visitor(client, self._around, self._labels, self.wake)
+        self._sessions[client.client_id] = BrowserSession(client, self._around, self._labels, self.wake)
         self.wake()
 
     def _leave(self, client: viser.ClientHandle) -> None:
-        self._visitors.pop(client.client_id, None)
+        self._sessions.pop(client.client_id, None)
 
-    def _exhibit(self, name: str) -> Exhibit:
-        if name not in self._exhibits:
-            self._exhibits[name] = self._open(name)
-        return self._exhibits[name]
+    def _shown_model(self, name: str) -> ShownModel:
+        if name not in self._shown_models:
+            self._shown_models[name] = self._open(name)
+        return self._shown_models[name]
 
-    def _serve(self, visitor: Visitor, key: tuple[int, int, float]) -> None:
+    def _serve(self, session: BrowserSession, key: tuple[int, int, float]) -> None:
         began = time.monotonic()
         try:
-            self._show(visitor, key)
+            self._show(session, key)
         except (ForeseenError, OSError, RuntimeError) as error:  # also a full GPU, or a file that was taken away
-            visitor.told.content = f"**{error}**"
+            session.told.content = f"**{error}**"
             key = (*key[:2], 1.0)  # it would fail in full, too
-        visitor.drawn = key
-        visitor.pace.drew(key[2], time.monotonic() - began)
+        session.drawn = key
+        session.pace.drew(key[2], time.monotonic() - began)
 
-    def _show(self, visitor: Visitor, key: tuple[int, int, float]) -> None:
+    def _show(self, session: BrowserSession, key: tuple[int, int, float]) -> None:
         share = key[2]
-        camera = visitor.camera(share)
-        left = self._exhibit(visitor.model.value)
-        if visitor.browser_draws is not None:
-            self._hand_over(visitor, left, camera)
+        camera = session.camera(share)
+        left = self._shown_model(session.model.value)
+        if session.browser_draws is not None:
+            self._hand_over(session, left, camera)
         else:
-            visitor.clear()
+            session.clear()
             began = time.monotonic()
-            pixels = self._drawn(visitor, left, camera)
+            pixels = self._drawn(session, left, camera)
             seconds = time.monotonic() - began
             quality = QUALITY_STILL if share == 1 else QUALITY_MOVING
-            visitor.client.scene.set_background_image(pixels, format="jpeg", jpeg_quality=quality)
+            session.client.scene.set_background_image(pixels, format="jpeg", jpeg_quality=quality)
             size = f"{camera.width} x {camera.height} in {1000 * seconds:.0f} ms"
-            beside = visitor.beside.value
-            second = "" if beside == NOTHING else f"right: {self._exhibit(beside).told()}"
-            visitor.told.content = "  \n".join(filter(None, [self.note, left.told(), second, size]))
+            beside = session.beside.value
+            second = "" if beside == NOTHING else f"right: {self._shown_model(beside).told()}"
+            session.told.content = "  \n".join(filter(None, [self.note, left.told(), second, size]))
         self.pictures += 1
 
-    def _drawn(self, visitor: Visitor, left: Exhibit, camera: Camera) -> Pixels:
-        mode, split = visitor.mode.value, visitor.split.value
-        if visitor.beside.value == NOTHING or split >= 1:
+    def _drawn(self, session: BrowserSession, left: ShownModel, camera: Camera) -> Pixels:
+        mode, split = session.mode.value, session.split.value
+        if session.beside.value == NOTHING or split >= 1:
             return left.draw(camera, mode)
-        right = self._exhibit(visitor.beside.value).draw(camera, mode)
+        right = self._shown_model(session.beside.value).draw(camera, mode)
         return right if split <= 0 else side_by_side(left.draw(camera, mode), right, split)
 
-    def _hand_over(self, visitor: Visitor, shown: Exhibit, camera: Camera) -> None:
+    def _hand_over(self, session: BrowserSession, shown: ShownModel, camera: Camera) -> None:
         """Let the browser draw; the Gaussians are sent again only when there are others."""
-        kind = visitor.browser_draws
-        wanted = (kind, visitor.model.value, visitor.sigmas.value, self.generation)
-        if visitor.held_for == wanted:
+        kind = session.browser_draws
+        wanted = (kind, session.model.value, session.sigmas.value, self.generation)
+        if session.held_for == wanted:
             return
-        visitor.clear()
-        visitor.ground(self._ground)
+        session.clear()
+        session.ground(self._ground)
         found = shown.gaussians(camera)
         if kind == SPLATS:
-            node = visitor.client.scene.add_gaussian_splats(
+            node = session.client.scene.add_gaussian_splats(
                 "/splats", found.means, found.covariances, found.colors / np.float32(255), found.opacities
             )
             note = f"{len(found.means):,} Gaussians, drawn by the browser with the colours of SH band 0"
-            visitor.held = [node]
+            session.held = [node]
         else:
             solid = found.largest()
-            visitor.held = [self._ellipsoids(visitor, solid)] if len(solid.means) else []
+            session.held = [self._ellipsoids(session, solid)] if len(solid.means) else []
             note = f"the {len(solid.means):,} of {len(found.means):,} Gaussians that cover most, as ellipsoids"
-        visitor.held_for = wanted
-        visitor.told.content = "  \n".join(filter(None, [self.note, shown.told(), note]))
+        session.held_for = wanted
+        session.told.content = "  \n".join(filter(None, [self.note, shown.told(), note]))
 
-    def _ellipsoids(self, visitor: Visitor, solid: ShownGaussians) -> viser.SceneNodeHandle:
+    def _ellipsoids(self, session: BrowserSession, solid: ShownGaussians) -> viser.SceneNodeHandle:
         vertices, faces = sphere()
-        return visitor.client.scene.add_batched_meshes_simple(
+        return session.client.scene.add_batched_meshes_simple(
             f"/{ELLIPSOIDS}", vertices, faces, solid.quats, solid.means,
-            batched_scales=solid.scales * np.float32(visitor.sigmas.value), lod="off",
+            batched_scales=solid.scales * np.float32(session.sigmas.value), lod="off",
             batched_colors=_lit(solid.colors), cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
 
@@ -218,10 +218,10 @@ class Viewer:
             )  # fmt: skip
 
             def jump(event: viser.SceneNodePointerEvent[viser.CameraFrustumHandle], name: str = each.name) -> None:
-                visitor = self._visitors.get(event.client.client_id)
-                if visitor is not None:
-                    visitor.cameras.value = name
-                    visitor.go_to(visitor.named(name))
+                session = self._sessions.get(event.client.client_id)
+                if session is not None:
+                    session.cameras.value = name
+                    session.go_to(session.named(name))
 
             frustum.on_click(jump)
             found.append(frustum)

@@ -3,8 +3,12 @@
 from splatwizard_core.plugins.forwarding import forward
 
 NAMES = (
-    "after_run", "entries", "exhibits", "frames", "live", "looks", "packing", "page_file", "shown_cameras",
-    "shown_gaussians", "viewer", "visitor",
+    "after_run", "entries", "frames", "live", "packing", "page_file", "shown_cameras", "shown_gaussians", "viewer",
 )  # fmt: skip
 
-forward(__name__, "sw_view", {"command": "sw_view.view_command", **{name: f"sw_view.{name}" for name in NAMES}})
+RENAMED = {
+    "command": "view_command", "exhibits": "shown_models", "looks": "mode_pictures", "visitor": "browser_session",
+}  # fmt: skip
+
+MOVED = {**{name: name for name in NAMES}, **RENAMED}
+forward(__name__, "sw_view", {old: f"sw_view.{new}" for old, new in MOVED.items()})

@@ -26,7 +26,8 @@ from sw_wisp.decoded import Decoded
 from sw_wisp.eight_bits import EightBitLayer, pack_layers, unpack_layers
 from sw_wisp.nested import UNIT, Reader, Writer
 from sw_wisp.numbers import GROUPS, NUMBERS
-from sw_wisp.octree import MOST_IN_A_CELL, Cells, Shares, file_order, fit_shares
+from sw_wisp.octree import MOST_IN_A_CELL, Cells, file_order, fit_shares
+from sw_wisp.octree_contexts import Shares
 from sw_wisp.packets import (
     KINDS,
     MOST_PLANES,

@@ -5,13 +5,12 @@ have finer cells below. Rows stand in Morton order of the cells' low corners, co
 
 For each level, nodes in Morton order: the bits of child 0 of every node, then of child 1, ... to 7; for each child that
 is occupied the flags "a splat ends here", "another one ends here" in unary, "it also goes on". Each bit has a stored
-probability by its context (`Shares`). The 64 nodes of level 2 are there without saying so. A node of level 3 and up
-has a child, so after seven zeros the last bit is not coded; at level 18 every child ends, and none goes on.
+probability by its context (`octree_contexts`). The 64 nodes of level 2 are there without saying so. A node of level 3
+and up has a child, so after seven zeros the last bit is not coded; at level 18 every child ends, and none goes on.
 """
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -19,20 +18,12 @@ from typing import Protocol
 import numpy as np
 
 from splatwizard_core.api import BitstreamError
-from sw_codecs.bits.packing import ByteReader, pack_fixed, packed_size, unpack_fixed
 from sw_codecs.positions import morton
 from sw_wisp.nested import UNIT, Stream
 from sw_wisp.numbers import HIGHEST_LEVEL, LOWEST_LEVEL
+from sw_wisp.octree_contexts import CONTEXTS, ENDS, LEVELS, MORE, ON, Around, Shares
 
 MOST_IN_A_CELL = 16
-CHILDREN, ENDS, MORE, ON = 0, 36, 39, 40
-"""Contexts of one level: child bits by ones so far, known class, siblings of the node; "ends" by known class."""
-CONTEXTS = 41
-KINDS = np.repeat(np.arange(4), [ENDS, MORE - ENDS, 1, 1])  # [41]
-LEVELS = HIGHEST_LEVEL - LOWEST_LEVEL + 1
-SEEN_ENOUGH = 32
-"""Bits that a context must have had to get a probability of its own."""
-BITS_OF_A_SHARE = 12
 
 
 @dataclass(frozen=True)
@@ -112,59 +103,6 @@ class Code(Protocol):
     def __call__(self, contexts: np.ndarray, wanted: np.ndarray | None) -> np.ndarray: ...
 
 
-@dataclass(frozen=True)
-class Shares:
-    """Probabilities of a 1 by level and context, times 4096: those of a level's kind of bit, or of a context alone.
-
-    shared  [16, 4] int64 in 1..4095, by level and kind (child bits, ends, more, on)
-    single  [16, 39] int64 in 0..4095, of contexts that have their own; 0: as `shared`
-    """
-
-    shared: np.ndarray
-    single: np.ndarray
-
-    @classmethod
-    def fitted(cls, counts: np.ndarray) -> Shares:
-        """From counts [16 * 41, 2] of zeros and ones; a context gets what it saves the bits of storing."""
-        table = counts.reshape(LEVELS, CONTEXTS, 2)
-        shared = _share(np.stack([table[:, kind == KINDS].sum(1) for kind in range(4)], axis=1))
-        table = table[:, :MORE]
-        single = _share(table)
-        saved = _bits(table, shared[:, KINDS[:MORE]]) - _bits(table, single)
-        return cls(shared, np.where((table.sum(2) >= SEEN_ENOUGH) & (saved > BITS_OF_A_SHARE), single, 0))
-
-    @functools.cached_property
-    def ones(self) -> np.ndarray:
-        """[16 * 41] int64 in 1..4095."""
-        table = self.shared[:, KINDS]
-        table[:, :MORE] = np.where(self.single > 0, self.single, table[:, :MORE])
-        return table.reshape(-1)
-
-    def pack(self) -> bytes:
-        """First and last level that has bits; of those the shared ones, which contexts have their own, and these."""
-        used = np.flatnonzero((self.shared != UNIT // 2).any(1))
-        first, last = (int(used[0]), int(used[-1])) if len(used) else (0, 0)
-        rows = slice(first, last + 1)
-        own = self.single[rows] > 0
-        parts = [(self.shared[rows], BITS_OF_A_SHARE), (own, 1), (self.single[rows][own], BITS_OF_A_SHARE)]
-        return bytes([first, last]) + b"".join(pack_fixed(p.reshape(-1).astype(np.uint64), width) for p, width in parts)
-
-    @classmethod
-    def unpack(cls, reader: ByteReader) -> Shares:
-        """Inverse of `pack`. Raises BitstreamError."""
-        first, last = reader.integer(1), reader.integer(1)
-        if not first <= last < LEVELS:
-            raise BitstreamError(f"the octree is said to have levels {first}..{last} of {LEVELS}")
-        rows, found = slice(first, last + 1), cls(np.full((LEVELS, 4), UNIT // 2), np.zeros((LEVELS, MORE), np.int64))
-        found.shared[rows] = _unpacked(reader, found.shared[rows].size, BITS_OF_A_SHARE).reshape(-1, 4)
-        own = np.zeros(found.single.shape, bool)
-        own[rows] = _unpacked(reader, own[rows].size, 1).reshape(-1, MORE) == 1
-        found.single[own] = _unpacked(reader, int(own.sum()), BITS_OF_A_SHARE)
-        if found.shared.min() < 1 or (found.single[own] < 1).any():
-            raise BitstreamError("a probability of the octree is 0")
-        return found
-
-
 class _Known:
     """Splats of earlier subsets: how many are in a cell, 0, 1 or more."""
 
@@ -215,7 +153,7 @@ def walk(
     """
     prices = np.zeros((LEVELS * CONTEXTS, 2)) if prices is None else prices
     known = _Known(earlier)
-    nodes, siblings = np.arange(64 if rows else 0), np.full(64, 2)
+    nodes = np.arange(64 if rows else 0)
     paid = np.zeros(64)  # by each splat in the node, so far
     inside = np.ones(64) if wanted is None else np.bincount(wanted.at(LOWEST_LEVEL - 1), minlength=64)
     found, costs, left = [Cells(np.empty(0, np.int64), np.empty(0, np.int64))], [np.empty(0)], rows
@@ -232,19 +170,20 @@ def walk(
 
         children = nodes[:, None] * 8 + np.arange(8)  # [M, 8]
         classes, occupied = known.classes(level, children), None if truth is None else truth.holds(children)
-        bits, ones, cost = np.zeros(children.shape, bool), np.zeros(len(nodes), np.int64), np.zeros(len(nodes))
+        around = Around(nodes, level - 1)
+        bits, cost = around.bits, np.zeros(len(nodes))
         for child in range(8):
             asked = np.arange(len(nodes))
             if child == 7 and level > LOWEST_LEVEL:
-                bits[ones == 0, 7] = True
-                asked = np.flatnonzero(ones)
-            contexts = (np.minimum(ones, 3) * 3 + classes[:, child]) * 3 + siblings
+                some = bits[:, :7].any(1)
+                bits[~some, 7] = True
+                asked = np.flatnonzero(some)
+            contexts = around.contexts(child, classes[:, child])[asked]
             answer = None if occupied is None else occupied[asked, child]
-            bits[asked, child] = ask(contexts[asked], asked, cost, answer)
-            ones += bits[:, child]
+            bits[asked, child] = ask(contexts, asked, cost, answer)
         place = np.flatnonzero(bits)
         parent, classes = place >> 3, classes.reshape(-1)[place]
-        nodes, siblings = children.reshape(-1)[place], np.minimum(ones, 3)[parent] - 1
+        nodes = children.reshape(-1)[place]
         empty = cost[inside == 0].sum() / rows  # of nodes of level 2 with nothing in them
         paid = (paid + cost / np.maximum(inside, 1))[parent] + empty
 
@@ -265,7 +204,7 @@ def walk(
         paid = paid + cost / inside
         found.append(Cells(np.full(int(count.sum()), level), np.repeat(nodes, count)))
         costs.append(np.repeat(paid, count))
-        nodes, siblings, paid = nodes[goes_on], siblings[goes_on], paid[goes_on]
+        nodes, paid = nodes[goes_on], paid[goes_on]
         inside = (inside - count)[goes_on]
         left -= int(count.sum())
         if left < len(nodes):
@@ -314,19 +253,3 @@ def position_bits(cells: Cells) -> np.ndarray:
 def _given(bits: np.ndarray | None) -> np.ndarray:
     assert bits is not None
     return bits
-
-
-def _share(counts: np.ndarray) -> np.ndarray:
-    """4096 times the share of ones, int64 [...] in 1..4095, for counts [..., 2]."""
-    total = counts.sum(-1)
-    share = np.rint(UNIT * counts[..., 1] / np.maximum(total, 1)).astype(np.int64)
-    return np.where(total > 0, np.clip(share, 1, UNIT - 1), UNIT // 2)
-
-
-def _bits(counts: np.ndarray, ones: np.ndarray) -> np.ndarray:
-    """Bits float64 [...] of counts [..., 2] under shares of ones [...]."""
-    return -counts[..., 1] * np.log2(ones / UNIT) - counts[..., 0] * np.log2(1 - ones / UNIT)
-
-
-def _unpacked(reader: ByteReader, count: int, width: int) -> np.ndarray:
-    return unpack_fixed(reader.take(packed_size(count, width)), count, width).astype(np.int64)

@@ -18,7 +18,8 @@ from splatwizard_core.api import BitstreamError
 from sw_codecs.entropy.exact_tables import LEVELS
 from sw_wisp.nested import UNIT, Stream, coarser, table_levels
 from sw_wisp.numbers import BLOCKS, COLOUR, LATENTS, NUMBERS, OPACITY, SHAPE
-from sw_wisp.octree import Cells, Shares, code_cells, joined
+from sw_wisp.octree import Cells, code_cells, joined
+from sw_wisp.octree_contexts import Shares
 
 KINDS = ("base", "fine", "view")
 PARAMETERS = ("mean", "scale", "multiplier")

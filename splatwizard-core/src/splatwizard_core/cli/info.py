@@ -24,6 +24,8 @@ from splatwizard_core.plugins import load_plugins
 def info(path: str, as_json: bool, chosen: Choices) -> None:
     """Show what is in PATH: a .swz file (bytes by section), a run directory (its file), a metrics.json (scores, and who
     served which phase), a .ply, or a scene (a folder, dataset/scene, or one that is made on the spot, by its name)."""
+    from splatwizard_core.scene.loading import family_of
+
     if not path.strip():
         raise click.UsageError("PATH is empty")
     where = existing(path) if Path(path).exists() else Path(path)
@@ -36,6 +38,9 @@ def info(path: str, as_json: bool, chosen: Choices) -> None:
         kind, facts, show = "record", _record_facts(where), _print_record
     elif (importer := load_plugins().importers.of_suffix(where)) is not None:
         kind, facts = importer, _gaussian_facts(where)
+    elif where.is_file() and family_of(path, load_plugins().datasets) is None:
+        kinds = sorted({e.declared["suffix"] for e in load_plugins().importers if e.declared.get("suffix")})
+        raise UserInputError(f"{path}: no file that `sw info` can read: .swz, metrics.json, {', '.join(kinds)}")
     else:
         kind, facts = "scene", _scene_facts(path, chosen)
     shared.print_facts({"kind": kind, **facts}, as_json, show)

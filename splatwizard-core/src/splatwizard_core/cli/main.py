@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.shell_completion import CompletionItem
 
-from splatwizard_core.cli.complete import COMPLETION_VARIABLE
+from splatwizard_core.cli.complete import COMPLETION_VARIABLE, completing_command
 from splatwizard_core.cli.streams import abandon_streams, ended_like_ctrl_c, open_streams, without_orders
 from splatwizard_core.errors import PluginError, TaskError
 from splatwizard_core.plugins import load_plugins
@@ -150,10 +150,8 @@ def _report(error: BaseException, arguments: Sequence[str], *, debug: bool) -> i
         _say(error.format_message())
         return error.exit_code
     if isinstance(error, click.NoSuchOption):
-        from splatwizard_core.cli.unknown_option import set_hint
-
-        hint = set_hint(error, arguments)
-        if hint is not None:
+        command = completing_command()
+        if command is not None and (hint := command.hint(error, arguments)) is not None:
             _say(f"error: {hint}")
             return error.exit_code
     if isinstance(error, click.ClickException):

@@ -86,7 +86,7 @@ def _state() -> dict[str, tuple[Any, Callable[[Any], Any], Any]]:
 
 
 def _kept_seeds() -> contextlib.AbstractContextManager[None]:
-    from splatwizard_native import preserved_random_states  # which imports torch
+    from splatwizard_core.base.random_states import preserved_random_states  # which imports torch
 
     return preserved_random_states()
 

@@ -91,7 +91,7 @@ class AdaptedRasterizer:
 
 
 def _map_channels(g: GaussianInputs, cam: Camera) -> dict[str, Tensor]:
-    """One value a Gaussian whose weighted sum over a pixel is the map, [N] each."""
+    """One value per Gaussian whose weighted sum over a pixel is the map, [N] each."""
     cam = cam.to(g.means.device, g.means.dtype)
     z = g.means @ cam.R[2] + cam.tau[2]
     safe = torch.where(z > cam.near, z, 1)  # others are culled; 1/z must not turn their gradient into NaN

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import logging
 import os
 from collections.abc import Callable, Iterable, Mapping
@@ -13,6 +12,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+from splatwizard_core.base.warned import warn_once
 from splatwizard_core.errors import CapabilityError, ConfigError, PluginError
 from splatwizard_core.gaussians.inputs import GaussianInputs
 from splatwizard_core.plugins.catalogue import catalogue, package_of
@@ -69,6 +69,7 @@ class NegotiatedRasterizer:
         """Names of the rasterizers that served a request; clear it to learn which ones serve from then on."""
         self._registry = plugins.rasterizers
         self._prefer = [self._registry.entry(name).name for name in prefer]
+        self._wanted = tuple(self._prefer)
         self._prefer += [self._registry.entry(name).name for name in suggested if name in self._registry]
         self._forbid = {self._registry.entry(name).name for name in forbid}
         forced = os.environ.get("SW_RASTERIZER")
@@ -79,6 +80,9 @@ class NegotiatedRasterizer:
         self._readable = [info for entry in self._registry if (info := self._read(entry)) is not None]
         self._usable = [info for info in self._readable if self._may_serve(info)]
         self._options = dict(options)
+        for info in self._readable:
+            if info.name in self._wanted and self.device.type not in info.devices:
+                warn_once(f"'{info.name}', which raster.prefer names, does not draw on {self.device.type}")
         self._check_profile(self._options.get("profile"))
         self.info = RasterizerInfo(
             name="negotiated",
@@ -151,7 +155,7 @@ class NegotiatedRasterizer:
             rasterizer = AdaptedRasterizer(rasterizer, missing)
             composing = f", composing {', '.join(sorted(missing))}"
         if passed_over is not None:
-            _warn_once(f"{passed_over}; rendering with '{best.name}' instead")
+            warn_once(f"{passed_over}; rendering with '{best.name}' instead")
         log.info("%s on %s: rasterizer '%s' (%s)%s", asked, self.device, best.name, best.exactness, composing)
         self.choices[asked] = best.name
         self._chosen[wanted] = rasterizer
@@ -201,7 +205,7 @@ class NegotiatedRasterizer:
         except PluginError as error:
             if entry.name in (self._forced, *self._prefer):
                 raise
-            _warn_once(f"{error}: it is not used")
+            warn_once(f"{error}: it is not used")
             return None
 
     def _check_profile(self, name: str | None) -> None:
@@ -237,8 +241,10 @@ class NegotiatedRasterizer:
         for info in sorted((i for i in self._usable if _can_serve(i, wanted)), key=rank, reverse=True):
             reason = self._unavailable(info)
             if reason is None:
-                # A failed build is news; what cannot run here by nature only if a slow oracle is all that remains.
-                news = [w for name, w in passed_over.items() if name in self._failed or info.speed <= 0]
+                # A failed build is news, and so is what the user named; what cannot run here by nature only if a slow
+                # oracle is all that remains.
+                told = {*self._failed, *self._wanted}
+                news = [w for name, w in passed_over.items() if name in told or info.speed <= 0]
                 return info, news[0] if news else None
             passed_over[info.name] = reason
         raise self._nothing(wanted, passed_over)
@@ -290,9 +296,3 @@ def _how_to_get_one() -> str:
     if not packages:
         return "`sw list-plugins` shows whether one is broken or left out"
     return f"pip install {packages[0]}" if len(packages) == 1 else f"install one of {', '.join(packages)} with pip"
-
-
-@functools.cache
-def _warn_once(message: str) -> None:
-    """Once per process: several rasterizers may share one kernel module."""
-    log.warning("%s", message)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard
 
 from splatwizard_core.base.toml_file import read_toml
+from splatwizard_core.base.warned import warn_once
 from splatwizard_core.errors import ConfigError, PluginError
 from splatwizard_core.evaluation.metrics import MetricSettings, check_settings
 from splatwizard_core.plugins.manager import PluginManager, load_plugins
@@ -315,7 +316,9 @@ def resolve(
         (str(config_file), flatten(method.Config, flatten(PipelineParams, tables))),
         ("--set", sets or {}),
     ):
-        layer = config.spelled(layer)
+        given_keys, layer = dict(layer), config.spelled(layer)
+        if source == "--set" or source == str(config_file):
+            _tell_older(method.Config, given_keys, layer, source)
         given: dict[type[Params], dict[str, Any]] = {method.Config: {}, PipelineParams: {}, SceneParams: {}}
         for key, value in layer.items():
             block = next((block for block in given if field_at(block, key) is not None), None)
@@ -345,6 +348,13 @@ def resolve(
         init, pretrained,
         check_settings(plugins.metrics, settings) if settings else {}, procedural,
     )  # fmt: skip
+
+
+def _tell_older(config: type[Params], given: Mapping[str, Any], today: Mapping[str, Any], source: str) -> None:
+    older = [key for key in given if key not in today and field_at(config, key) is None]
+    newer = ", ".join(key for key in today if key not in given) or "nothing"
+    if older:
+        warn_once(f"{source}: {', '.join(older)} of release 0.2 is now {newer} (docs/migration.md)")
 
 
 def _check_names(said: Mapping[str, str], config_file: str | Path | None, **asked: str | None) -> None:

@@ -16,7 +16,7 @@ from splatwizard_core.runs.record import (
     Quality,
     TrainBlock,
 )
-from splatwizard_core.training.figures import Provided, StagePlan
+from splatwizard_core.training.measurements import Provided, StagePlan
 from splatwizard_native import CoreTime
 
 CONTENDED = "contended"

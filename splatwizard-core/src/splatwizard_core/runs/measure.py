@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import torch
 
+from splatwizard_core.base.machine import describe_machine
 from splatwizard_core.evaluation import evaluate as quality
 from splatwizard_core.evaluation.metrics import MetricSetup, chosen_metrics
 from splatwizard_core.evaluation.speed import SpeedBlock, SpeedReport, measure_speed
@@ -25,7 +26,7 @@ from splatwizard_core.runs.session import Session
 from splatwizard_core.runs.training_views import training_psnr
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import Scene
-from splatwizard_native import CoreTime, MemoryMeter, describe_machine, loading_time, synchronize, work_time
+from splatwizard_native import CoreTime, MemoryMeter, loading_time, synchronize, work_time
 
 FEWEST_SPEED_VIEWS = 8
 

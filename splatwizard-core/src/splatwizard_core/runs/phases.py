@@ -15,7 +15,7 @@ from splatwizard_core.plugins.origins import NOBODY, Origins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.runs.facts import EncodingFacts, Measurement, TrainingFacts
 from splatwizard_core.runs.record import PhaseBlock
-from splatwizard_core.training.figures import Provided
+from splatwizard_core.training.measurements import Provided
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.scheduler import build_schedulers
 from splatwizard_core.training.stage import Stage

@@ -1,7 +1,7 @@
 """The result record, metrics.json, that every table is made from. A versioned schema; unknown values are null.
 
 A value that is null has its reason in `unknown`, by dotted name; no value is ever 0 for "not measured".
-A field is declared here (or in `training.figures`, `evaluation.speed`) and filled where it is measured. From the
+A field is declared here (or in `training.measurements`, `evaluation.speed`) and filled where it is measured. From the
 declaration follow why it may be null (`WhyNull`), its row of docs/protocol.md (tools/record_docs.py), what readers of
 other releases' records take, and with `Shown` its row in the report.
 Source: evaluation protocol, result record.
@@ -18,7 +18,7 @@ from pydantic import ConfigDict, Field, ValidationError
 from splatwizard_core.base.block import Block, MemoryKind, Shown, WhyNull
 from splatwizard_core.errors import SplatwizardError, UserInputError
 from splatwizard_core.evaluation.speed import SpeedBlock, SpreadBlock
-from splatwizard_core.training.figures import LoopFigures, Provided, StagePlan
+from splatwizard_core.training.measurements import LoopFigures, Provided, StagePlan
 from splatwizard_native import load_strict, write_atomic
 
 SCHEMA = 3

@@ -10,6 +10,7 @@ import contextlib
 from datetime import datetime, timezone
 from pathlib import Path
 
+from splatwizard_core.base.warned import WARNED
 from splatwizard_core.errors import SplatwizardError, UserInputError
 from splatwizard_core.evaluation.metrics import MetricSetup, chosen_metrics, metric_identities
 from splatwizard_core.plugins.versions import changes, installed, providers
@@ -67,7 +68,8 @@ def run(session: Session, request: RunRequest) -> tuple[schema.Record, Path]:
             arguments = ["eval", str(encoded), "--config", str(directory / CONFIG), "--device", str(session.device)]
             arguments += ["--renders", str(directory / RENDERS), "--repeats", str(request.repeats), "--quiet", "--json"]
             arguments += ["--geometry"] * request.geometry
-            facts = Measurement.model_validate(run_fresh(arguments, told=session.told))
+            told = [*session.told, *(f"WARNING: {line}" for line in WARNED)]
+            facts = Measurement.model_validate(run_fresh(arguments, told=told))
             return facts.model_copy(update={"asked": asked})
 
         encoding = steps.once(

@@ -28,7 +28,7 @@ from splatwizard_core.runs.session import Session, TrainedModel
 from splatwizard_core.scene.images import decode_all
 from splatwizard_core.streams import stream
 from splatwizard_core.training.checkpoint import CheckpointStore
-from splatwizard_core.training.figures import LoopFigures
+from splatwizard_core.training.measurements import LoopFigures
 from splatwizard_core.training.pipeline import TrainingRun
 from splatwizard_native import CoreTime, sweep, write_atomic
 

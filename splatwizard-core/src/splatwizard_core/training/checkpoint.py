@@ -28,8 +28,8 @@ from torch import Tensor
 
 from splatwizard_core.base.block import Block
 from splatwizard_core.errors import CheckpointError
-from splatwizard_core.training.figures import TrainingFigures
 from splatwizard_core.training.keys import dotted
+from splatwizard_core.training.measurements import TrainingFigures
 from splatwizard_native import TEMPORARY, replacing
 
 T = TypeVar("T")

@@ -10,10 +10,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
+from splatwizard_core.base.interrupt import InterruptGuard
+from splatwizard_core.base.random_states import preserved_random_states
+from splatwizard_core.base.scalars import read_scalars
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.training.state import TrainingState
 from splatwizard_core.training.timing import LoopClock
-from splatwizard_native import InterruptGuard, preserved_random_states, read_scalars, synchronize, track
+from splatwizard_native import synchronize, track
 
 if TYPE_CHECKING:
     from splatwizard_core.training.pipeline import TrainingRun

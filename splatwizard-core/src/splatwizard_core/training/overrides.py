@@ -12,6 +12,12 @@ from splatwizard_core.errors import ConfigError
 from splatwizard_core.training.keys import block_keys, field_at, set_at, suggest
 from splatwizard_core.training.params import OptimizationParams
 
+_REASONS = {
+    "int_parsing_size": "a whole number that fits 64 bits",
+    "extra_forbidden": "left out: there is no such key",
+    "string_too_short": "a text that is not empty",
+}
+"""Kind of pydantic's error -> what a value must be, where its own words do not say."""
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
@@ -62,9 +68,9 @@ def _bad_value(
     # The culprit is the longest given key that the location starts with; a check over several fields has no location.
     path = ".".join(map(str, first["loc"]))
     key = max((k for k in values if path == k or path.startswith(f"{k}.")), key=len, default=path)
-    reason = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
-    if first["type"] == "int_parsing_size":
-        reason = "a whole number that fits 64 bits"
+    reason = _REASONS.get(first["type"]) or first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
+    if first["type"] == "missing":
+        return ConfigError(f"{source}: '{path}' is missing", key=path)
     if not key:
         return ConfigError(f"bad combination of values in {source}: {reason}")
     value = values.get(key, first.get("input"))

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from splatwizard_core.base.random_states import seeded
 from splatwizard_core.base.rng import Streams
 from splatwizard_core.base.run_log import RunLog
 from splatwizard_core.errors import CheckpointError, ConfigError
@@ -26,8 +27,8 @@ from splatwizard_core.training.checkpoint import (
     differences,
     normalised,
 )
-from splatwizard_core.training.figures import Provided, StagePlan, TrainingFigures
 from splatwizard_core.training.housekeeping import Evaluate, Housekeeping, OnStep
+from splatwizard_core.training.measurements import Provided, StagePlan, TrainingFigures
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.plan import plan_rows
 from splatwizard_core.training.scheduler import build_schedulers
@@ -35,7 +36,7 @@ from splatwizard_core.training.stage import Stage, StageContext
 from splatwizard_core.training.state import TrainingState
 from splatwizard_core.training.timing import StageClock
 from splatwizard_core.training.trainer import Trainer
-from splatwizard_native import MemoryMeter, seeded
+from splatwizard_native import MemoryMeter
 
 __all__ = ["TrainOutcome", "TrainingRun", "TrainingStopped"]
 

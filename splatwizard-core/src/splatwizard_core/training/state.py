@@ -9,17 +9,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from splatwizard_core.base.random_states import capture_random_states, restore_random_states
 from splatwizard_core.base.rng import Streams
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.rendering.rasterizer import Rasterizer
 from splatwizard_core.scene.scene import Scene
 from splatwizard_core.training.checkpoint import Checkpoint, normalised
-from splatwizard_core.training.figures import TrainingFigures
+from splatwizard_core.training.measurements import TrainingFigures
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.scheduler import Scheduler, build_schedulers
 from splatwizard_core.training.stage import CameraIterator, CameraSampler, Stage
 from splatwizard_core.training.tasks import SOURCES, TaskContext
-from splatwizard_native import capture_random_states, restore_random_states
 
 
 @dataclass(kw_only=True, repr=False)

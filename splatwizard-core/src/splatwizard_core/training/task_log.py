@@ -30,5 +30,7 @@ class TaskLog:
         """
         number = torch.as_tensor(value, dtype=torch.float64).detach().clone()
         if not name or number.numel() != 1:
-            raise ValueError(f"curve '{name}' needs a name, and one number a step, not a shape of {list(number.shape)}")
+            raise ValueError(
+                f"curve '{name}' needs a name, and one number per step, not the shape {list(number.shape)}"
+            )
         self.scalars[name] = number

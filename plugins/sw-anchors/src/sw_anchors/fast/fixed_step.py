@@ -23,7 +23,7 @@ from sw_anchors.fast.seen_rows import SeenRows
 from sw_anchors.fast.spawn import visible_gaussians
 from sw_anchors.neural_gaussians import NeuralGaussians
 from sw_anchors.noisy_values import ENTROPY, MASK_THRESHOLD, QUANTIZED
-from sw_anchors.rate_model import AnchorForecast, AnchorRate, Context, RateModel
+from sw_anchors.rate_model import AnchorForecast, AnchorRate, RateInputs, RateModel
 from sw_anchors.shape import AnchorShape
 
 PARAMETERS = ("features", "log_scales", "offsets", "mask_logits")
@@ -35,7 +35,6 @@ class Model(Protocol):
 
     phase: str
     sample: float
-    noise_factor: float
     mlp_opacity: nn.Sequential
     mlp_cov: nn.Sequential
     mlp_color: nn.Sequential
@@ -63,8 +62,8 @@ class Model(Protocol):
         """Factors of the soft masks."""
         ...
 
-    def base_steps_like(self, like: Tensor) -> Tensor:
-        """Base steps on a device."""
+    def noise_steps(self, like: Tensor) -> Tensor:
+        """Steps [1,3] of the noise in the phase QUANTIZED, on a device."""
         ...
 
     def own_generator(self) -> torch.Generator | None:
@@ -167,14 +166,14 @@ def decode_rows(model: Model, at: FixedRows, pool: PoolRows | None) -> Found:
     valid = (torch.arange(capacity, device=noise.device) < at.count).to(noise)
     steps: Tensor | None = None
     if model.phase == QUANTIZED:
-        steps = model.base_steps_like(noise)[None] * model.noise_factor
+        steps = model.noise_steps(noise)
     elif model.phase == ENTROPY:
         if pool is None:
             drawn, is_drawn = sample_of(draws + 0.5, valid, model.sample)
             forecast = model.rate_model.forecast(at.parts, drawn)
             steps = forecast.steps
         else:
-            both: Context = tuple(torch.cat(pair) for pair in zip(at.parts, pool.parts, strict=True))
+            both: RateInputs = tuple(torch.cat(pair) for pair in zip(at.parts, pool.parts, strict=True))
             forecast = model.rate_model.forecast(both, slice(capacity, None))
             steps = forecast.steps[:capacity]
     given = (at.parameters, at.weights, at.count, None if steps is None else noise, steps, MASK_THRESHOLD)

@@ -8,7 +8,7 @@ import torch
 from sw_anchors.anchors import linear_layers
 from sw_anchors.fast.predicted_steps import predicted_steps
 from sw_anchors.fast.rows import take_rows
-from sw_anchors.rate_model import AnchorForecast, Context, Rows
+from sw_anchors.rate_model import AnchorForecast, RateInputs, Rows
 from sw_anchors.shape import GROUPS
 from torch import Tensor, nn
 
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from sw_cat_3dgs.context import CatContext
 
 
-def fits(rows: Context) -> bool:
+def fits(rows: RateInputs) -> bool:
     """Whether the rows are sites on the planes."""
     return len(rows) == len(PlaneSites._fields)
 
 
-def forecast(context: CatContext, base: Tensor, rows: Context, drawn: Rows) -> AnchorForecast:
+def forecast(context: CatContext, base: Tensor, rows: RateInputs, drawn: Rows) -> AnchorForecast:
     """As `rate_model.forecast`, for rows that are PlaneSites."""
     first, last = linear_layers(context.network)
     sizes = [sum(context.shape.outputs[:-1]), len(GROUPS)]

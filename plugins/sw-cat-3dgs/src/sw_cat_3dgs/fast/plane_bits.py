@@ -45,7 +45,7 @@ class _JointBits(torch.autograd.Function):
     """Planes per scale [K,C,H,W], then weight and bias of each layer of K networks -> bits of all values.
 
     Derivatives are taken on the way there: bits are a sum, so backward only scales them. On CUDA one kernel does it
-    all; elsewhere some channels at a time, since what layers hold, 380 bytes a value, is then there for one part at a
+    all; elsewhere some channels at a time, since what layers hold, 380 bytes per value, is then there for one part at a
     time; an anchor has 30 values.
     The incoming derivative must not be negative, as of a loss that has bits as a term: it decides nothing here about
     what pulls a probability off its floor.

@@ -86,7 +86,7 @@ def unpack_fixed(data: bytes | memoryview, count: int, width: int) -> np.ndarray
 
 
 def write_varint(value: int) -> bytes:
-    """A non-negative integer, 7 bits a byte, least significant first, top bit set on all but the last."""
+    """A non-negative integer, 7 bits per byte, least significant first, top bit set on all but the last."""
     if not 0 <= value < 1 << 64:
         raise ValueError(f"{value} is not an unsigned 64-bit integer")
     out = bytearray()

@@ -1,6 +1,6 @@
 """Histograms in a file: counts rounded to three bits after the leading one, differences coded under one meta table.
 
-A count c below 16 is kept; above, its top four bits are. The code distance is 0.0005 bit a symbol at worst, and a
+A count c below 16 is kept; above, its top four bits are. The code distance is 0.0005 bit per symbol at worst, and a
 table of 256 counts takes about 100 bytes instead of 512.
 """
 

@@ -1,4 +1,4 @@
-"""Entropy coder `huffman`: codes of whole bits from tables of counts; simple, up to 1 bit a symbol above the rest."""
+"""Entropy coder `huffman`: codes of whole bits from tables of counts; simple, up to 1 bit per symbol above the rest."""
 
 from __future__ import annotations
 

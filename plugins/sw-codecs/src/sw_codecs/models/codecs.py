@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class Exact:
-    """float32 as trained, 236 bytes a Gaussian at SH degree 3."""
+    """float32 as trained, 236 bytes per Gaussian at SH degree 3."""
 
     def __init__(self, plugins: PluginManager) -> None:
         pass
@@ -41,7 +41,7 @@ class Quantized:
 
 
 class Ply:
-    """The .ply of 3DGS as it is, 248 bytes a Gaussian at SH degree 3: the size that pruning papers report."""
+    """The .ply of 3DGS as it is, 248 bytes per Gaussian at SH degree 3: the size that pruning papers report."""
 
     def __init__(self, plugins: PluginManager) -> None:
         pass

@@ -1,6 +1,6 @@
 """The file in mode `exact`: all six tensors as float32, bit for bit.
 
-236 bytes a Gaussian at SH degree 3, 232 a surfel.
+236 bytes per Gaussian at SH degree 3, 232 per surfel.
 """
 
 from __future__ import annotations

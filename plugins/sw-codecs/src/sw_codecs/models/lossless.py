@@ -2,7 +2,8 @@
 
 Rows follow the Morton curve through 2^21 cells an axis, so that successive Gaussians are neighbours. Positions are
 stored as steps from row to row, and the bytes of equal weight of each column lie together for zstd at level 19.
-The low mantissa bits of trained values are noise and stay so: the demo scene shrinks from 236 to 193 bytes a Gaussian.
+The low mantissa bits of trained values are noise and stay so: the demo scene shrinks from 236 to 193 bytes per
+Gaussian.
 """
 
 from __future__ import annotations

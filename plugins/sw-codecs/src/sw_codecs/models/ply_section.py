@@ -1,6 +1,6 @@
-"""A file that holds the .ply of 3DGS as it is: what most pruning papers count as their size, 248 bytes a Gaussian.
+"""A file that holds the .ply of 3DGS as it is: what most pruning papers count as their size, 248 bytes per Gaussian.
 
-Bit for bit what `sw export` writes and viewers read; 12 bytes a Gaussian are normals that are always zero. That of
+Bit for bit what `sw export` writes and viewers read; 12 bytes per Gaussian are normals that are always zero. That of
 surfels lacks a scale: 244 bytes.
 """
 
@@ -48,7 +48,7 @@ def decode(reader: ContainerReader) -> GaussianModel:
 
 
 def _header(n: int, rest: int, scales: int) -> bytes:
-    """The text in front of the rows of n Gaussians with `rest` higher SH coefficients a channel, as `to_ply` has it."""
+    """The text before the rows of n Gaussians with `rest` higher SH coefficients per channel, as `to_ply` has it."""
     tails = ((3,), (1, 3), (rest, 3), (), (scales,), (4,))
     none = gaussians_of(*(torch.zeros(0, *tail) for tail in tails))
     return to_ply(none).replace(b"element vertex 0\n", f"element vertex {n}\n".encode())

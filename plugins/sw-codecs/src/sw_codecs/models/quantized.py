@@ -72,7 +72,7 @@ class Layout(Params):
 
     @property
     def decoded_bytes(self) -> int:
-        """Of the model in float32: 236 a Gaussian at SH degree 3, 232 a surfel."""
+        """Of the model in float32: 236 a Gaussian at SH degree 3, 232 per surfel."""
         return 4 * self.num_gaussians * (11 + self.scales + 3 * ((self.max_sh_degree + 1) ** 2 - 1))
 
     @property

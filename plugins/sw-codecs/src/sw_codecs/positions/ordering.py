@@ -1,6 +1,6 @@
 """The order in which points are stored: along a Morton curve, so that neighbours in space are neighbours.
 
-The order of a set of points carries log2(n!) bits that nobody needs (15 bits a point at n = 1e5), and what differs
+The order of a set of points carries log2(n!) bits that nobody needs (15 bits per point at n = 1e5), and what differs
 little from row to row codes shorter. Source: specification of the codec library, point positions.
 """
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 from collections import Counter
@@ -281,8 +282,9 @@ def _existing(path: Path, picture_folder: str) -> Path:
 
 
 def _has_pictures(folder: Path) -> bool:
-    with os.scandir(folder) as entries:
+    with contextlib.suppress(PermissionError), os.scandir(folder) as entries:
         return any(os.path.splitext(each.name)[1].lower() in SUFFIXES for each in entries)
+    return False
 
 
 def _unused(folder: Path, registered: int) -> list[str]:

@@ -250,7 +250,7 @@ def add_noise(
 ) -> None:
     """Shift every mean, in place, by lr * strength * sigmoid(-100 (opacity - min_opacity)) * Sigma z, z ~ N(0, I).
 
-    generator   on the model's device: a million normal numbers a step are not to travel
+    generator   on the model's device: a million normal numbers per step are not to travel
     lr          step size of the means, world units
 
     Sigma = R S^2 R^T, and R^T z is as normal as z: one rotation suffices.

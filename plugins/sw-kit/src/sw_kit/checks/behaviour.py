@@ -36,7 +36,7 @@ PUBLISHED = 0.8
 
 
 def check_pruner(entry: Entry, plugins: PluginManager) -> str:
-    """Hold a pruner to one number a Gaussian, to be repeatable, and to leave model and gradients as they are."""
+    """Hold a pruner to one number per Gaussian, to be repeatable, and to leave model and gradients as they are."""
     pruner, model = make(entry, plugins), some_gaussians()
     if pruner.uses_statistics:
         generator = torch.Generator().manual_seed(1)

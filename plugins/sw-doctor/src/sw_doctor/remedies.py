@@ -1,4 +1,4 @@
-"""The line that mends a plugin which does not work."""
+"""Advice about a plugin that does not work, in one line."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from packaging.utils import canonicalize_name
 from sw_doctor.packages import import_names
 
 
-def cure_of(distribution: str, why: str, *, foreign: bool) -> str:
+def remedy_of(distribution: str, why: str, *, foreign: bool) -> str:
     """Return the command that helps against `why`, which a plugin or an entry of `distribution` gave.
 
     foreign     it is none of ours: a newer version may help, and nobody needs it

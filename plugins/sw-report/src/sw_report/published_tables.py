@@ -42,7 +42,7 @@ class Measured:
 
 
 @dataclass(frozen=True)
-class BesideTable:
+class PublishedTable:
     """A scene, or the mean over a data set.
 
     groups      what was measured, each with the published figures of its method
@@ -87,7 +87,7 @@ class BesideTable:
         return [*(each.figure for _, found in self.groups for each in found), *self.others]
 
 
-def beside_tables(runs: Sequence[Run], *, others: bool = True) -> list[BesideTable]:
+def published_tables(runs: Sequence[Run], *, others: bool = True) -> list[PublishedTable]:
     """Put runs beside the published figures of their scenes, and means over whole data sets beside published means.
 
     others  with the figures of methods that were not measured
@@ -132,12 +132,12 @@ def beside_tables(runs: Sequence[Run], *, others: bool = True) -> list[BesideTab
 
 def _table(
     title: str, dataset: str, scene: str | None, rows: list[Measured], figures: Sequence[Figure], others: bool
-) -> BesideTable:
+) -> PublishedTable:
     groups = [(each, beside(each.facts, scene, figures)) for each in rows]
     methods = {each.facts.method for each in rows}
     left = [f for f in figures if (f.dataset, f.scene) == (dataset, scene) and f.method not in methods]
     fit, unfit = ([f for f in left if f.protocol.comparable is wanted] for wanted in (True, False))
-    return BesideTable(title, groups, fit if others else [], unfit if others else [])
+    return PublishedTable(title, groups, fit if others else [], unfit if others else [])
 
 
 def _curves(
@@ -165,7 +165,7 @@ def size_at_equal(equal: AtEqual) -> float | None:
     return None if equal.ratio is None else 100 * (equal.ratio - 1)
 
 
-def to_dict(table: BesideTable) -> dict[str, Any]:
+def to_dict(table: PublishedTable) -> dict[str, Any]:
     """The table as JSON data."""
     groups = []
     for measured, found in table.groups:

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from splatwizard_native import ForeseenError, seeded
+from splatwizard_core.base.random_states import seeded
+from splatwizard_native import ForeseenError
 
 
 def drawn() -> list[float]:

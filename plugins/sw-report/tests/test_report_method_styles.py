@@ -1,4 +1,4 @@
-"""Colours and markers: one look a method on every page, and colours that people with colour blindness tell apart."""
+"""Colours and markers: one style a method on every page, and colours that people with colour blindness tell apart."""
 
 import itertools
 import re
@@ -7,7 +7,7 @@ from importlib import resources
 import numpy as np
 import pytest
 from sw_report.charts import STYLES
-from sw_report.looks import LOOKS, look_of, looks_of
+from sw_report.method_styles import METHOD_STYLES, style_of_method, styles_of
 from sw_report.page import PageOptions, render_page
 from sw_report.runs import collect
 
@@ -96,40 +96,40 @@ def test_every_colour_stands_out_from_the_paper():
 
 
 def test_no_two_methods_of_the_field_look_alike():
-    looks = [look_of(method) for method in FIELD]
-    assert len(set(looks)) == len(looks)
-    assert max(sum(look % STYLES == colour for look in looks) for colour in range(STYLES)) == 3
+    styles = [style_of_method(method) for method in FIELD]
+    assert len(set(styles)) == len(styles)
+    assert max(sum(style % STYLES == colour for style in styles) for colour in range(STYLES)) == 3
     together = FIELD[:1] + FIELD[6:14]
-    assert len({look_of(method) % STYLES for method in together}) == STYLES  # nine methods
+    assert len({style_of_method(method) % STYLES for method in together}) == STYLES  # nine methods
     surfaces = FIELD[1:6]
-    assert len({look_of(method) % STYLES for method in surfaces}) == len(surfaces)
+    assert len({style_of_method(method) % STYLES for method in surfaces}) == len(surfaces)
 
 
 def test_a_method_looks_alike_whatever_stands_beside_it(make_curve, tmp_path):
     make_curve("3dgs")
-    alone = looks_of(collect([tmp_path]).runs)
+    alone = styles_of(collect([tmp_path]).runs)
     for method in ("hac", "another", "lightgaussian"):
         make_curve(method)
-    together = looks_of(collect([tmp_path]).runs)
-    assert alone["3dgs"] == together["3dgs"] == look_of("3dgs")
+    together = styles_of(collect([tmp_path]).runs)
+    assert alone["3dgs"] == together["3dgs"] == style_of_method("3dgs")
     assert len(set(together.values())) == 4
 
 
 def test_configurations_of_a_method_share_its_colour_and_nothing_else(make_run, tmp_path):
     for preset in ("paper", "quick", "slow"):
         make_run(out=tmp_path / preset, change=lambda c, preset=preset: c.update(preset=preset))
-    looks = looks_of(collect([tmp_path]).runs)
-    assert len(looks) == len(set(looks.values())) == 3
-    assert {look % STYLES for look in looks.values()} == {look_of("toy") % STYLES}
+    styles = styles_of(collect([tmp_path]).runs)
+    assert len(styles) == len(set(styles.values())) == 3
+    assert {style % STYLES for style in styles.values()} == {style_of_method("toy") % STYLES}
 
 
 def test_methods_of_one_number_are_told_apart(make_run, tmp_path):
-    other = next(name for name in map(str, range(10_000)) if look_of(name) == look_of("toy"))
+    other = next(name for name in map(str, range(10_000)) if style_of_method(name) == style_of_method("toy"))
     for method in ("toy", other):
         make_run(method=method)
-    looks = looks_of(collect([tmp_path]).runs)
-    assert sorted(look == look_of("toy") for look in looks.values()) == [False, True]
-    assert max(looks.values()) < LOOKS
+    styles = styles_of(collect([tmp_path]).runs)
+    assert sorted(style == style_of_method("toy") for style in styles.values()) == [False, True]
+    assert max(styles.values()) < METHOD_STYLES
 
 
 def test_a_method_has_one_colour_through_the_whole_page(make_curve, tmp_path):
@@ -140,4 +140,4 @@ def test_a_method_has_one_colour_through_the_whole_page(make_curve, tmp_path):
         name = rf"{method}(?: \((?:r\d(?:, )?)+\)| r\d)?"
         keys = re.findall(rf'swatch s(\d)"(?:(?!<li>).)*?</svg> {name}</li>', text, re.S)
         assert len(keys) > 4  # curves, trainings, views
-        assert set(keys) == {str(look_of(method) % STYLES)}
+        assert set(keys) == {str(style_of_method(method) % STYLES)}

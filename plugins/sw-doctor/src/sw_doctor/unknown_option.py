@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import click
 
-from splatwizard_core.cli.complete import KEY
+from sw_doctor.words import words
 
 
 def set_hint(error: click.NoSuchOption, arguments: Sequence[str]) -> str | None:
@@ -26,7 +26,7 @@ def set_hint(error: click.NoSuchOption, arguments: Sequence[str]) -> str | None:
         return None
     methods = [after for word, after in itertools.pairwise(arguments) if word in ("--method", "-m")]
     context.params["methods"] = tuple(methods)  # the parser did not come so far
-    keys = [key.removesuffix("=") for key in KEY.find(context)]
+    keys = [key.removesuffix("=") for key in words("key", context)]
     name = _plain(given)
     found = [key for key in keys if _plain(key) == name] or [
         key for key in keys if _plain(key.rpartition(".")[2]) == name

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from splatwizard_native.cores import available_cores
+from splatwizard_native import available_cores
 
 
 def describe_machine(device: torch.device) -> dict[str, Any]:

@@ -15,7 +15,7 @@ PICTURE, DEPTH, NORMALS = "picture", "depth", "normals"
 MODES = (PICTURE, DEPTH, NORMALS)
 
 
-def look(drawing: Drawing, camera: Camera, mode: str = PICTURE) -> Pixels:
+def mode_picture(drawing: Drawing, camera: Camera, mode: str = PICTURE) -> Pixels:
     """Draw what a camera sees, [H,W,3]. Raises CapabilityError where no rasterizer offers the mode.
 
     mode    of `MODES`; depths are coloured between the 2nd and the 98th percentile of the view

@@ -1,4 +1,4 @@
-"""One browser that looks: its panel, the camera that it moves, and what it was last sent."""
+"""A browser that is connected to the viewer: its panel, the camera that it moves, and what it was last sent."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from splatwizard_core.api import Camera
 from sw_view.frames import Pace, camera_at, frame_size, orientation_of
-from sw_view.looks import MODES, PICTURE
+from sw_view.mode_pictures import MODES, PICTURE
 from sw_view.shown_cameras import NamedCamera, Surroundings
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ NOTHING = "nothing"
 
 
 @dataclass
-class Visitor:
+class BrowserSession:
     """State of one browser.
 
     changed     counts what makes the last picture an old one

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from splatwizard_native.errors import ForeseenError
+from splatwizard_native import ForeseenError
 
 WORKSPACES = ":4096:8", ":16:8"
 """Values of CUBLAS_WORKSPACE_CONFIG with which equal products on a GPU have equal bits."""
