@@ -31,16 +31,16 @@ class RateTerm(Params):
 
 
 class Steps(Params):
-    """Base quantiser steps of the numbers of a splat."""
+    """Quantiser steps of the numbers of a splat, or where they start from if they follow the networks."""
 
-    opacity: float = Field(0.75, gt=0, le=4, description="of the opacity logit")
-    shape: float = Field(0.4, gt=0, le=4, description="of the five numbers of the log covariance's deviator")
-    size: float = Field(0.25, gt=0, le=4, description="of the mean log scale")
-    luma: float = Field(0.05, gt=0, le=4, description="of the luma of SH band 0")
-    chroma: float = Field(0.07, gt=0, le=4, description="of its two chromas")
-    latents: float = Field(0.15, gt=0, le=4, description="of the latents, SH units")
+    opacity: float = Field(0.2, gt=0, le=4, description="of the opacity logit")
+    shape: float = Field(0.12, gt=0, le=4, description="of the five numbers of the log covariance's deviator")
+    size: float = Field(0.07, gt=0, le=4, description="of the mean log scale")
+    luma: float = Field(0.015, gt=0, le=4, description="of the luma of SH band 0")
+    chroma: float = Field(0.02, gt=0, le=4, description="of its two chromas")
+    latents: float = Field(0.12, gt=0, le=4, description="of the latents, SH units")
     factor: float = Field(1.0, gt=0, le=8, description="multiplies all of them")
-    adaptive: bool = Field(True, description="let the networks of the context multiply them by up to 2 or 1/64")
+    adaptive: bool = Field(True, description="let them follow the networks of the context, by splat")
 
 
 class Context(Params):
@@ -137,7 +137,7 @@ class Loss(Params):
 class Encode(Params):
     """How the integers are fixed."""
 
-    rdoq: bool = Field(True, description="of each number the index that costs least in loss and bits; else the nearest")
+    rdoq: bool = Field(False, description="of each number the index that costs least in loss and bits; else the nearest")
 
 
 class Codec(OwnCodec):
