@@ -137,7 +137,7 @@ class Loss(Params):
 class Encode(Params):
     """How the integers are fixed."""
 
-    rdoq: bool = Field(False, description="of each number the index that costs least in loss and bits; else the nearest")
+    rdoq: bool = Field(False, description="of each number the index of least loss and bits; else the nearest")
 
 
 class Codec(OwnCodec):
