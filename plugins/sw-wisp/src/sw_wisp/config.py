@@ -64,7 +64,8 @@ class Positions(Params):
     """The cell of a splat: its level in the octree."""
 
     rule: Literal["mid", "sensitivity"] = Field(
-        "mid", description="mid: cells of eta times the middle scale; sensitivity: by the error that a shift makes"
+        "sensitivity",
+        description="mid: cells of eta times the middle scale; sensitivity: by the error that a shift makes",
     )
     eta: float = Field(0.5, gt=0, le=4, description="edge of a cell in middle scales: what the rate points set")
     level_min: int = Field(3, ge=3, le=18, description="coarsest level")
