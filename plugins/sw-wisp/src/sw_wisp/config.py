@@ -31,16 +31,16 @@ class RateTerm(Params):
 
 
 class Steps(Params):
-    """Base quantiser steps of the numbers of a splat."""
+    """Quantiser steps of the numbers of a splat, or where they start from if they follow the networks."""
 
-    opacity: float = Field(0.75, gt=0, le=4, description="of the opacity logit")
-    shape: float = Field(0.4, gt=0, le=4, description="of the five numbers of the log covariance's deviator")
-    size: float = Field(0.25, gt=0, le=4, description="of the mean log scale")
-    luma: float = Field(0.05, gt=0, le=4, description="of the luma of SH band 0")
-    chroma: float = Field(0.07, gt=0, le=4, description="of its two chromas")
-    latents: float = Field(0.15, gt=0, le=4, description="of the latents, SH units")
+    opacity: float = Field(0.2, gt=0, le=4, description="of the opacity logit")
+    shape: float = Field(0.12, gt=0, le=4, description="of the five numbers of the log covariance's deviator")
+    size: float = Field(0.07, gt=0, le=4, description="of the mean log scale")
+    luma: float = Field(0.015, gt=0, le=4, description="of the luma of SH band 0")
+    chroma: float = Field(0.02, gt=0, le=4, description="of its two chromas")
+    latents: float = Field(0.12, gt=0, le=4, description="of the latents, SH units")
     factor: float = Field(1.0, gt=0, le=8, description="multiplies all of them")
-    adaptive: bool = Field(True, description="let the networks of the context multiply them by up to 2 or 1/64")
+    adaptive: bool = Field(True, description="let them follow the networks of the context, by splat")
 
 
 class Context(Params):
@@ -51,6 +51,12 @@ class Context(Params):
         description="none: a mean and a deviation for each number and level; pyramid: networks on running means of the "
         "splats before",
     )
+    fit: int = Field(
+        600,
+        ge=0,
+        le=100_000,
+        description="updates of the networks on bits alone when noise begins, no pictures",
+    )
     rebuild: int = Field(200, ge=1, description="steps between measurements; half as many while numbers are rounded")
 
 
@@ -58,7 +64,8 @@ class Positions(Params):
     """The cell of a splat: its level in the octree."""
 
     rule: Literal["mid", "sensitivity"] = Field(
-        "mid", description="mid: cells of eta times the middle scale; sensitivity: by the error that a shift makes"
+        "sensitivity",
+        description="mid: cells of eta times the middle scale; sensitivity: by the error that a shift makes",
     )
     eta: float = Field(0.5, gt=0, le=4, description="edge of a cell in middle scales: what the rate points set")
     level_min: int = Field(3, ge=3, le=18, description="coarsest level")
@@ -131,7 +138,7 @@ class Loss(Params):
 class Encode(Params):
     """How the integers are fixed."""
 
-    rdoq: bool = Field(True, description="of each number the index that costs least in loss and bits; else the nearest")
+    rdoq: bool = Field(False, description="of each number the index of least loss and bits; else the nearest")
 
 
 class Codec(OwnCodec):

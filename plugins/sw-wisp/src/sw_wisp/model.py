@@ -69,6 +69,7 @@ class WispModel(SplatModel):
     phase       what is drawn: see `rounding`; in eval mode noise and soft rounding are left out
     sharpness   of soft rounding, up to `sharpest`
     jitters     whether positions are drawn anywhere in a cell of the splat's level around them
+    adapts      whether quantiser steps may follow the rate model
     """
 
     ROWS = ("means", "opacity", "shape", "size", "colour", "latents", "levels")
@@ -95,7 +96,7 @@ class WispModel(SplatModel):
                 self.ROWS = (*self.ROWS, name)
         self.network, self.rate = network, rate
         self.cube = cube
-        self.phase, self.sharpness, self.sharpest, self.jitters = FLOAT, 1.0, sharpest, False
+        self.phase, self.sharpness, self.sharpest, self.jitters, self.adapts = FLOAT, 1.0, sharpest, False, False
         self.split_seed = 0
 
     def log_edges(self, levels: Tensor) -> Tensor:
@@ -153,6 +154,19 @@ class WispModel(SplatModel):
     def begin_rate(self) -> None:
         """Start the rate model anew from the splats."""
         self._take(self.rate.begin(self._placed()))
+
+    def fit_rate(self, updates: int, weights: Tensor | None) -> None:
+        """Let the rate model learn from the splats as they are drawn, without pictures.
+
+        weights     [N,22] bits that a squared unit of error of each number is worth, for the steps; None: they stay
+        """
+        context = tuple(getattr(self, name) for name in self.rate.CONTEXT)
+        self.rate.fit(context, self.numbers().detach(), self._rounded, updates, weights)
+
+    def adapt(self) -> None:
+        """Let quantiser steps follow the rate model from here on."""
+        self.adapts = True
+        self.rate.adapt()
 
     def measure(self) -> None:
         """Bring the rate model up to date with the splats; once the integers are fixed, only what it reads."""
@@ -221,7 +235,7 @@ class WispModel(SplatModel):
 
     def state_dict_extra(self) -> dict[str, Any]:
         modes = {"phase": self.phase, "sharpness": self.sharpness, "jitters": self.jitters}
-        modes |= {"rounds": self.network.rounds}
+        modes |= {"rounds": self.network.rounds, "adapts": self.adapts}
         return {**modes, "seed": self.split_seed, "low": list(self.cube.low), "edge": self.cube.edge}
 
     def load_state_dict_extra(self, extra: dict[str, Any]) -> None:
@@ -230,5 +244,7 @@ class WispModel(SplatModel):
         self.network.rounds = bool(extra["rounds"])
         if self.network.rounds:
             self.rate.round_weights()
+        if extra["adapts"]:
+            self.adapt()
         low = [float(x) for x in extra["low"]]
         self.cube = Cube((low[0], low[1], low[2]), float(extra["edge"]))

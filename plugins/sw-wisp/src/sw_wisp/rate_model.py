@@ -17,9 +17,10 @@ from torch import Tensor, nn
 
 from sw_wisp.context import ContextNetworks, Draw, Forecast
 from sw_wisp.nested import UNIT, index_bits
-from sw_wisp.numbers import HIGHEST_LEVEL, LOWEST_LEVEL, NUMBERS
+from sw_wisp.numbers import BLOCKS, HIGHEST_LEVEL, LOWEST_LEVEL, NUMBERS
+from sw_wisp.predicting import STEPS_OF
 from sw_wisp.pyramid import walked_features
-from sw_wisp.rate import bits, sigma_of
+from sw_wisp.rate import bits, level_of, sigma_of
 from sw_wisp.static import ENOUGH, MEAN_UNIT, StaticContext
 
 if TYPE_CHECKING:
@@ -30,6 +31,10 @@ TABLES = 64
 WINDOW = 255
 """Indices that are told apart when a table is chosen; those beyond count as the last."""
 LEVELS = HIGHEST_LEVEL - LOWEST_LEVEL + 1
+FIT_LR, LAST_FIT_LR, FIT_BATCH = 0.01, 0.05, 2048
+"""Of `PyramidRate.fit`: Adam step size, that of the last update over it, splats of an update."""
+LEAST_MULTIPLIER, MOST_MULTIPLIER = 1 / 64, 1.99
+"""Bounds of the steps to begin with, in those of `sw_wisp.numbers`."""
 LARGEST_MEAN = 32767
 """Of the file, in units of 16/4096 base steps."""
 
@@ -61,6 +66,19 @@ class RateModel(Protocol):
 
     def begin(self, splats: Placed) -> dict[str, Tensor]:
         """Start from these splats; return rows of the model, by name, for it to predict from."""
+        ...
+
+    def fit(
+        self, context: tuple[Tensor, ...], values: Tensor, draw: Draw, updates: int, weights: Tensor | None
+    ) -> None:
+        """Learn to code values [N,22], drawn by `draw`, in few bits, without pictures.
+
+        weights     [N,22] bits that a squared unit of error of a number is worth: steps follow these; None: they stay
+        """
+        ...
+
+    def adapt(self) -> None:
+        """Let quantiser steps follow the networks from here on, if they are to."""
         ...
 
     def measure(self, splats: Placed, context: tuple[Tensor, ...]) -> dict[str, Tensor]:
@@ -122,6 +140,14 @@ class StaticRate(nn.Module):
     def begin(self, splats: Placed) -> dict[str, Tensor]:
         return self.measure(splats, ())
 
+    def fit(
+        self, context: tuple[Tensor, ...], values: Tensor, draw: Draw, updates: int, weights: Tensor | None
+    ) -> None:
+        """Do nothing: `measure` finds what is best."""
+
+    def adapt(self) -> None:
+        """Do nothing: steps are the base steps."""
+
     @torch.no_grad()
     def measure(self, splats: Placed, context: tuple[Tensor, ...]) -> dict[str, Tensor]:
         """Take the means, and for each the table of fewest bits."""
@@ -165,14 +191,23 @@ class StaticRate(nn.Module):
 class PyramidRate(nn.Module):
     """Networks on running means of the splats before (`sw_wisp.context`), whose features are rows of the model.
 
-    adaptive    whether quantiser steps follow the networks
+    steps       [22] quantiser steps to begin with; the networks count in those of `sw_wisp.numbers`
+    adaptive    whether steps follow the networks, from `adapt` on
     """
 
     CONTEXT = ("features", "view_features")
 
-    def __init__(self, base_steps: Tensor, *, adaptive: bool, generator: torch.Generator | None = None) -> None:
+    def __init__(self, steps: Tensor, *, adaptive: bool, generator: torch.Generator | None = None) -> None:
         super().__init__()
-        self.networks = ContextNetworks(base_steps.float(), adaptive=adaptive, generator=generator)
+        self.adaptive, self.adapts = adaptive, False
+        self.networks = ContextNetworks(generator=generator)
+        places = [
+            (steps / self.networks.base_steps)[block].clamp(LEAST_MULTIPLIER, MOST_MULTIPLIER) for block in BLOCKS
+        ]
+        self._multipliers = [
+            [float(place[groups.index(group)]) for group in range(max(groups) + 1)]
+            for place, groups in zip(places, STEPS_OF, strict=True)
+        ]
 
     @property
     def base_steps(self) -> Tensor:
@@ -185,7 +220,39 @@ class PyramidRate(nn.Module):
         self.networks.measure_prior(units)
         features = self._features(splats, units, (units - self.networks.prior / UNIT).round())
         self.networks.start(*features, units)
+        self._set_steps()
         return dict(zip(self.CONTEXT, features, strict=True))
+
+    def _set_steps(self) -> None:
+        """Make the steps those to begin with, deviations as they are."""
+        for network, multipliers, groups in zip(self.networks.networks, self._multipliers, STEPS_OF, strict=True):
+            last, width = network[-1], len(groups)  # type: ignore[index]
+            chosen = last.bias.new_tensor(multipliers)
+            last.bias[2 * width :] = torch.atanh(chosen - 1)
+            sigma = sigma_of(last.bias[width : 2 * width], 1.0)  # as if the multipliers were 1
+            last.bias[width : 2 * width] = level_of(sigma, chosen[groups])
+
+    @torch.enable_grad()
+    def fit(
+        self, context: tuple[Tensor, ...], values: Tensor, draw: Draw, updates: int, weights: Tensor | None
+    ) -> None:
+        """Take Adam steps on the bits of some splats each, and what the errors of rounding are worth."""
+        optimizer = torch.optim.Adam(self.networks.parameters(), lr=FIT_LR)
+        for update in range(updates):
+            optimizer.param_groups[0]["lr"] = FIT_LR * LAST_FIT_LR ** (update / updates)
+            rows = torch.randint(len(values), (min(FIT_BATCH, len(values)),), device=values.device)
+            known = tuple(each[rows] for each in context)
+            forecast, drawn = self._predict(known, values[rows], draw, weights is not None)
+            cost = bits_of(drawn, forecast).sum(1)
+            if weights is not None:
+                cost = cost + (weights[rows] * forecast.steps.square()).sum(1) / 12
+            optimizer.zero_grad()
+            cost.mean().backward()
+            optimizer.step()
+
+    def adapt(self) -> None:
+        """Let gradients move the steps."""
+        self.adapts = self.adaptive
 
     @torch.no_grad()
     def measure(self, splats: Placed, context: tuple[Tensor, ...]) -> dict[str, Tensor]:
@@ -205,9 +272,17 @@ class PyramidRate(nn.Module):
         return walked_features(self.networks.prior, splats.levels, splats.cells, units, indices)
 
     def predict(self, context: tuple[Tensor, ...], values: Tensor, draw: Draw) -> tuple[Forecast, Tensor]:
+        return self._predict(context, values, draw, self.adapts)
+
+    def _predict(
+        self, context: tuple[Tensor, ...], values: Tensor, draw: Draw, adapts: bool
+    ) -> tuple[Forecast, Tensor]:
         forecast: Forecast
-        forecast, drawn = self.networks(*context, values, draw)
-        return forecast, drawn
+        if adapts:
+            forecast, drawn = self.networks(*context, values, draw)
+            return forecast, drawn
+        forecast, drawn = self.networks(*context, values, lambda v, mean, steps: draw(v, mean, steps.detach()))
+        return forecast._replace(steps=forecast.steps.detach()), drawn
 
     def round_weights(self) -> None:
         """Compute with the weights of the file, of eight bits."""

@@ -45,6 +45,8 @@ from sw_wisp.worth import Worth, slopes, worth
 
 NETWORKS = ("network", "rate")
 NETWORK_EPS = 1e-8
+FITS = 2
+"""Times that the networks are fitted before the first bits are counted, each to what the one before left."""
 SENSITIVE_VIEWS = 64
 """Most views that squared slopes are measured over inside a training."""
 
@@ -139,6 +141,9 @@ class WispStage(Stage):
         phases, rebuild = self.config.phases, self.config.context.rebuild
         scheduler.register_task(range(self.iterations + 1), self.update_lr, name="update lr")
         scheduler.register_task(self.when(phases.noise), self.begin_noise, name="begin noise")
+        rate = self.config.rate_term
+        if self.adaptive:
+            scheduler.register_task(self.when(rate.start + rate.ramp), self.adapt, name="steps follow the networks")
         scheduler.register_task(self.when(list(phases.levels)), self.fix_levels, name="fix levels")
         scheduler.register_task(self.when(phases.cells), self.begin_jitter, name="draw positions anywhere in cells")
         scheduler.register_task(self.when(phases.place), self.place, name="place splats in cells")
@@ -163,10 +168,15 @@ class WispStage(Stage):
             if name in optimizer.groups:
                 optimizer.set_lr(name, rate)
 
-    def begin_noise(self, model: WispModel) -> None:
-        """Draw numbers with uniform noise from here on."""
+    def begin_noise(self, model: WispModel, cameras: CameraIterator, rasterizer: Rasterizer, scene: Scene) -> None:
+        """Draw numbers with uniform noise from here on; the rate model learns what they are like as they stand."""
         model.begin_rate()
         model.phase = NOISE
+        self.fit(model, cameras, rasterizer, scene.background.to(model.device), "noise")
+
+    def adapt(self, model: WispModel) -> None:
+        """Let gradients move the steps, now that bits have their full price."""
+        model.adapt()
 
     def begin_jitter(self, model: WispModel) -> None:
         """Draw positions anywhere in a cell around them from here on."""
@@ -217,6 +227,7 @@ class WispStage(Stage):
         model.means.copy_(model.cube.centres(model.levels, cells))
         model.jitters = False
         self.measure(model)
+        self.fit(model, cameras, rasterizer, scene.background.to(model.device), "place")
 
     def freeze(
         self,
@@ -309,16 +320,42 @@ class WispStage(Stage):
             levels = levels_by_cost(squared.double() * scale, self.price(), cube.edge, rule.eta)
         model.levels = levels.clamp(rule.level_min, rule.level_max)
 
+    @property
+    def adaptive(self) -> bool:
+        """Whether steps follow the networks."""
+        return self.config.context.kind == "pyramid" and self.config.steps.adaptive
+
+    def fit(
+        self, model: WispModel, views: list[View], rasterizer: Rasterizer, background: Tensor, stream_name: str
+    ) -> None:
+        """Let the networks learn from the splats as they stand, steps by what the pictures lose and bits cost."""
+        if self.config.context.kind != "pyramid":
+            return
+        weights = None
+        if self.adaptive and self.price():
+            with still(model):
+                weights = self.weights(model, views, rasterizer, background, f"steps/{stream_name}").float()
+            weights = weights / self.price()
+        for _ in range(FITS):
+            model.fit_rate(self.config.context.fit // FITS, weights)
+            model.measure()
+
+    def weights(
+        self, model: WispModel, views: list[View], rasterizer: Rasterizer, background: Tensor, stream_name: str
+    ) -> Tensor:
+        """Return the rise of the loss [N,22] float64 for each squared unit that a number is off."""
+        draws = stream(model.split_seed, stream_name)
+        squared = slopes(model, WispModel.NUMBERS, views, rasterizer, background, draws)
+        found = self.worth(model, views, rasterizer, background)
+        table = torch.cat([squared[name].flatten(1) if squared[name].dim() > 1 else squared[name][:, None]
+                           for name in WispModel.NUMBERS], dim=1)  # fmt: skip
+        return table.double() * found.loss_of_error
+
     def rate_distortion(
         self, model: WispModel, views: list[View], rasterizer: Rasterizer, background: Tensor
     ) -> RateDistortion:
         """Return what chooses indices by the loss that an error of each number makes, and the price of its bits."""
-        draws = stream(model.split_seed, "indices")
-        squared = slopes(model, WispModel.NUMBERS, views, rasterizer, background, draws)
-        found = self.worth(model, views, rasterizer, background)
-        table = torch.cat([squared[name].flatten(1) if squared[name].dim() > 1 else squared[name][:, None]
-                           for name in WispModel.NUMBERS], dim=1)  # [N,22]  # fmt: skip
-        weights = table.double().cpu().numpy() * found.loss_of_error
+        weights = self.weights(model, views, rasterizer, background, "indices").cpu().numpy()
         return RateDistortion(weights, self.price(), model.rate.base_steps.double().cpu().numpy())
 
     def set_latent_steps(self, model: WispModel, views: list[View], rasterizer: Rasterizer, background: Tensor) -> None:

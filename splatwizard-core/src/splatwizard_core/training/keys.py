@@ -117,8 +117,11 @@ def suggest(key: str, known: Sequence[str]) -> str | None:
 
 
 def is_beside_method(config: type[BaseModel], key: str) -> bool:
-    """Whether a key is none of a method's `config` but one of the run or of how the scene is read."""
-    return field_at(config, key) is None and any(field_at(beside, key) for beside in (PipelineParams, SceneParams))
+    """Whether a key is none of a method's `config` but one of the run, of the scene that it starts from, or of how the
+    pictures are read.
+    """
+    besides = any(field_at(beside, key) for beside in (PipelineParams, SceneParams)) or key.startswith("pretrained.")
+    return field_at(config, key) is None and besides
 
 
 def value_at(config: BaseModel, key: str) -> Any:
