@@ -32,6 +32,8 @@ def some_networks(seed: int = 0, **changes) -> ContextNetworks:
             last = network[-1]
             last.weight.copy_(torch.randn(last.weight.shape, generator=draws) * 0.3)
             last.bias[width : 2 * width] = 30.0
+        for tie in net.ties:
+            tie.copy_(torch.randn(tie.shape, generator=draws) * 0.2)
     return net
 
 
@@ -47,6 +49,7 @@ def bits_of(state) -> np.ndarray:
 def test_counts_of_the_networks():
     counts = [sum(p.numel() for p in network.parameters()) for network in ContextNetworks().networks]
     assert counts == [2_339, 4_094, 2_695, 4_225]
+    assert sum(tie.numel() for tie in ContextNetworks().ties) == 18 + 6 + 96
 
 
 @pytest.mark.parametrize(("subsets", "planes"), [(1, 0), (3, 1), (2, 2)])
@@ -143,7 +146,8 @@ def test_the_context_returns_and_damage_is_refused():
     reader.finish()
     assert np.array_equal(again.prior, context.prior)
     assert not again.adaptive
-    assert all(np.array_equal(a.weights, b.weights) for a, b in zip(again.layers, context.layers, strict=True))
+    pairs = [*zip(again.layers, context.layers, strict=True), *zip(again.ties, context.ties, strict=True)]
+    assert all(np.array_equal(a.weights, b.weights) for a, b in pairs)
     data = bytearray(context.pack())
     for damaged in (data[:100], bytes([7]) + data[1:]):
         with pytest.raises(BitstreamError):
@@ -226,6 +230,29 @@ def test_smooth_colour_costs_little():
     waves = torch.tensor([[1.5, 2.5, 0.0], [3.0, -2.0, 0.0], [1.0, 3.5, 0.0]]).double()
     spent, marginal = colour_bits(plane(10_000, lambda at: torch.sin(at @ waves.T)))
     assert spent < 0.4 * marginal
+
+
+def test_chroma_that_follows_luma_costs_what_is_left():
+    """Noise of chroma that luma tells 0.8 of, in deviations, costs log2(1 / 0.6) = 0.74 bits less than by itself."""
+    draws = torch.Generator().manual_seed(1)
+    luma, own = torch.randn(2, 10_000, 1, generator=draws, dtype=torch.float64)
+    still = torch.zeros_like(luma)
+    free, _ = colour_bits(plane(10_000, lambda at: torch.cat([0.3 * luma, 0.3 * own, still], dim=1)))
+    tied, _ = colour_bits(plane(10_000, lambda at: torch.cat([0.3 * luma, 0.24 * luma + 0.18 * own, still], dim=1)))
+    assert (free - tied) / 10_000 == pytest.approx(0.74, abs=0.05)
+
+
+def test_a_splat_far_from_its_first_latents_expects_others_far():
+    """Latents of one strength a splat cost less than the entropy that they would have one by one."""
+    draws = torch.Generator().manual_seed(2)
+    strength = torch.exp(0.8 * torch.randn(6000, 1, generator=draws, dtype=torch.float64))
+    scene = made_up(6000)
+    values = scene.values.clone()
+    values[:, 10:] = 0.3 * strength * torch.randn(6000, 12, generator=draws, dtype=torch.float64)
+    scene = replace(scene, values=values.clamp(-2.9, 2.9))
+    net = fitted_context(scene.levels, scene.cells, scene.values, STEPS, updates=300)
+    spent = bits_of(written(replace(scene, context=net.exact()))[1].decoded.state)[:, 10:].mean(0)
+    assert spent[4:].mean() < spent[:4].mean() - 0.1
 
 
 def test_white_noise_costs_what_it_must():

@@ -137,11 +137,22 @@ def test_largest_weights_of_the_context_still_add_up_exactly():
         replace(layer, weights=np.full_like(layer.weights, 127), exponents=np.full_like(layer.exponents, 5))
         for layer in context.layers
     )
-    largest = file.PyramidContext(context.prior, layers)
+    ties = tuple(
+        replace(tie, weights=np.full_like(tie.weights, 127), exponents=np.full_like(tie.exponents, 5))
+        for tie in context.ties
+    )
+    largest = file.PyramidContext(context.prior, layers, ties)
     data = written(replace(made_up(60), context=largest))
     assert decoded(data) == "decoded"
     fine = replace(context.layers[0], exponents=np.full_like(context.layers[0].exponents, -13))
     with pytest.raises(BitstreamError, match="finer"):
         file.PyramidContext.unpack(
-            file.ByteReader(file.PyramidContext(context.prior, (fine, *context.layers[1:])).pack())
+            file.ByteReader(file.PyramidContext(context.prior, (fine, *context.layers[1:]), context.ties).pack())
         )
+    for changed in (
+        replace(context.ties[2], exponents=np.full_like(context.ties[2].exponents, -13)),
+        replace(context.ties[2], weights=np.full_like(context.ties[2].weights, -128)),
+    ):
+        damaged = replace(context, ties=(*context.ties[:2], changed, *context.ties[3:]))
+        with pytest.raises(BitstreamError, match="of a tie is out of range"):
+            file.PyramidContext.unpack(file.ByteReader(damaged.pack()))

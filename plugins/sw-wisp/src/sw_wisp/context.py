@@ -27,10 +27,11 @@ from sw_codecs.context.two_layers import two_layers
 from sw_codecs.entropy.exact_tables import exact_tables
 from sw_wisp.eight_bits import EXACT_EXPONENT, EightBitLayer, rounded_weights
 from sw_wisp.nested import UNIT
-from sw_wisp.numbers import BASE_STEPS, BLOCKS, NUMBERS
+from sw_wisp.numbers import BASE_STEPS, BLOCKS, NUMBERS, PARTS
 from sw_wisp.predicting import STEPS_OF, PyramidContext, network_shapes
-from sw_wisp.rate import level_of
+from sw_wisp.rate import level_of, sigma_of
 from sw_wisp.static import MEAN_UNIT
+from sw_wisp.ties import LARGEST_SIZE, ROUNDING, tie_shapes
 
 LARGEST_PRIOR = 32767 * MEAN_UNIT
 Draw = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -49,9 +50,21 @@ class Forecast(NamedTuple):
     scale: Tensor
     steps: Tensor
 
+    def part(self, columns: slice) -> Forecast:
+        """Those of some of the numbers."""
+        return Forecast(self.mean[:, columns], self.scale[:, columns], self.steps[:, columns])
+
+
+def _residuals(drawn: Tensor, known: Forecast, unit: Tensor) -> tuple[Tensor, Tensor]:
+    """Residuals [N,c] in base steps, and their sizes: over the deviation of drawn numbers, at most 4; constants."""
+    mean, scale, steps = (each.detach() for each in known)
+    deviation = (sigma_of(scale, steps).square() + ROUNDING * steps.square()).sqrt()
+    residual = drawn - mean
+    return residual / unit, (residual.abs() / deviation).clamp_max(LARGEST_SIZE)
+
 
 class ContextNetworks(nn.Module):
-    """Four networks, for opacity; shape and size; colour; latents: 13,353 numbers.
+    """Four networks, for opacity; shape and size; colour; latents: 13,353 numbers; ties of 120 within their blocks.
 
     base_steps  [22] quantiser steps for a multiplier of 1
     prior       [22] int64 means where nothing is known, base steps with 12 fractional bits, multiples of 16
@@ -68,6 +81,7 @@ class ContextNetworks(nn.Module):
     ) -> None:
         super().__init__()
         self.adaptive, self.rounds = adaptive, False
+        self.ties = nn.ParameterList(torch.zeros(shape) for shape in tie_shapes())
         self.networks = nn.ModuleList(
             two_layers(inputs, hidden, outputs, generator, start="silent")
             for inputs, hidden, outputs in network_shapes()
@@ -85,7 +99,8 @@ class ContextNetworks(nn.Module):
 
         draw    None: values as they are
         """
-        parts: list[tuple[Tensor, Tensor, Tensor]] = []
+        parts: list[Forecast] = []
+        ties = iter(self.ties)
         drawn = values[:, :0]
         for number, block in enumerate(BLOCKS):
             own = view_features if number == len(BLOCKS) - 1 else features
@@ -94,11 +109,27 @@ class ContextNetworks(nn.Module):
             out = self._evaluate(number, torch.cat([own, known], dim=1))
             mean = (own[:, block] + out[:, :width]) * unit
             steps = (self._multipliers(out[:, 2 * width :])[:, STEPS_OF[number]] * unit).expand(len(values), -1)
-            part = values[:, block]
-            drawn = torch.cat([drawn, part if draw is None else draw(part, mean, steps)], dim=1)
-            parts.append((mean, out[:, width : 2 * width], steps))
+            found = Forecast(mean, out[:, width : 2 * width], steps)
+            told: list[tuple[Tensor, Tensor]] = []
+            for columns in PARTS[number]:
+                own = found.part(slice(columns.start - block.start, columns.stop - block.start))
+                if told:
+                    own = self._tied(next(ties), own, told, self.base_steps[columns])
+                part = values[:, columns]
+                taken = part if draw is None else draw(part, own.mean, own.steps)
+                told.append(_residuals(taken.detach(), own, self.base_steps[columns]))
+                drawn = torch.cat([drawn, taken], dim=1)
+                parts.append(own)
         mean, scale, steps = (torch.cat(each, dim=1) for each in zip(*parts, strict=True))
         return Forecast(mean, scale, steps), drawn
+
+    def _tied(self, tie: Tensor, own: Forecast, told: list[tuple[Tensor, Tensor]], unit: Tensor) -> Forecast:
+        """Forecast of a part, given residuals and sizes of those before it in its block."""
+        weights = rounded_weights(tie, EXACT_EXPONENT) if self.rounds else tie
+        half = len(weights) // 2
+        residuals, sizes = (torch.cat(each, dim=1) for each in zip(*told, strict=True))
+        mean = own.mean + F.linear(residuals, weights[:half]) * unit
+        return Forecast(mean, own.scale + F.linear(sizes, weights[half:]), own.steps)
 
     def _evaluate(self, number: int, inputs: Tensor) -> Tensor:
         first, _, last = self.networks[number]  # type: ignore[misc, union-attr]
@@ -138,8 +169,11 @@ class ContextNetworks(nn.Module):
     def exact(self) -> PyramidContext:
         """The same as the file holds it."""
         layers = []
+        ties = [
+            EightBitLayer.nearest(t.detach().cpu().double().numpy(), None, lowest=EXACT_EXPONENT) for t in self.ties
+        ]
         for network in self.networks:
             for layer in (network[0], network[-1]):  # type: ignore[index]
                 arrays = [each.detach().cpu().double().numpy() for each in (layer.weight, layer.bias)]
                 layers.append(EightBitLayer.nearest(*arrays, lowest=EXACT_EXPONENT))
-        return PyramidContext(self.prior.cpu().numpy(), tuple(layers), self.adaptive)
+        return PyramidContext(self.prior.cpu().numpy(), tuple(layers), tuple(ties), self.adaptive)

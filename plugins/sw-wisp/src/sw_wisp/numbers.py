@@ -50,4 +50,11 @@ LOWEST_LEVEL, HIGHEST_LEVEL = 3, 18
 """Levels of the octree at which splats may sit; a cell of level l has edge root edge / 2^l."""
 
 BLOCKS = (OPACITY.columns, slice(SHAPE.columns.start, SIZE.columns.stop), COLOUR.columns, LATENTS.columns)
-"""Columns that are predicted and coded at once: opacity; shape and size; colour; latents."""
+"""Columns that are predicted at once: opacity; shape and size; colour; latents."""
+PARTS = (
+    (OPACITY.columns,),
+    (slice(1, 4), slice(4, 7)),
+    (slice(7, 8), slice(8, 9), slice(9, 10)),
+    (slice(10, 14), slice(14, 18), slice(18, 22)),
+)
+"""Columns of each block that are coded at once, and that later parts of it follow (`ties`)."""

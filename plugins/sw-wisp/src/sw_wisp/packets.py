@@ -17,7 +17,7 @@ import numpy as np
 from splatwizard_core.api import BitstreamError
 from sw_codecs.entropy.exact_tables import LEVELS
 from sw_wisp.nested import UNIT, Stream, coarser, table_levels
-from sw_wisp.numbers import BLOCKS, COLOUR, LATENTS, NUMBERS, OPACITY, SHAPE
+from sw_wisp.numbers import BLOCKS, COLOUR, LATENTS, NUMBERS, OPACITY, PARTS, SHAPE
 from sw_wisp.octree import Cells, code_cells, joined
 from sw_wisp.octree_contexts import Shares
 
@@ -25,8 +25,8 @@ KINDS = ("base", "fine", "view")
 PARAMETERS = ("mean", "scale", "multiplier")
 REFINED = slice(SHAPE.columns.start, COLOUR.columns.stop)
 """Columns that `base` holds coarsely: shape, size, colour."""
-MEAN_LIMIT = 1 << 20
-"""Predicted means stay within this many 1/4096 base steps."""
+VALUE_LIMIT = 1 << 20
+"""Predicted means, and values that predict, stay within this many 1/4096 base steps."""
 HIGHEST_SCALE = (LEVELS - 1) * UNIT
 MOST_SUBSETS, MOST_PLANES = 16, 2
 
@@ -47,6 +47,10 @@ class Prediction:
     mean: np.ndarray
     scale: np.ndarray
     multiplier: np.ndarray
+
+    def part(self, columns: slice) -> Prediction:
+        """Those of some of the columns."""
+        return Prediction(self.mean[:, columns], self.scale[:, columns], self.multiplier[:, columns])
 
 
 @dataclass
@@ -101,6 +105,9 @@ class Context(Protocol):
     def predict(self, block: slice, rows: np.ndarray, state: State) -> Prediction:
         """Distributions of the columns `block` of splats `rows`, all blocks before it known."""
 
+    def moved(self, part: slice, rows: np.ndarray, state: State) -> tuple[np.ndarray, np.ndarray] | None:
+        """What parts of a block before it add to the means and scales [n,c] of `part`; None: nothing."""
+
     def changed(self, rows: np.ndarray, columns: slice, before: np.ndarray | None, state: State) -> None:
         """Take note that `columns` of splats became known, or finer than `before` [n,c]."""
 
@@ -148,7 +155,9 @@ class Walk:
 
     def finish(self) -> None:
         """Predict latents that no packet holds, from all that is known: they stand at their means."""
-        self._predict(LATENTS.columns, np.flatnonzero(~self.state.has_view))
+        rows = np.flatnonzero(~self.state.has_view)
+        if len(rows):
+            self._keep(LATENTS.columns, rows, self._context.predict(LATENTS.columns, rows, self.state))
 
     def _base(self, stream: Stream, packet: Packet) -> None:
         state, number = self.state, len(self._rows)
@@ -159,25 +168,33 @@ class Walk:
             self._chosen = np.concatenate([self._chosen, np.zeros((len(rows), NUMBERS), np.int32)])
         for wave in self._waves(rows):
             for block in BLOCKS[:-1]:
-                self._predict(block, wave)
-                self._code(stream, block, wave, 0 if block == OPACITY.columns else self._planes)
+                self._block(stream, block, wave, 0 if block == OPACITY.columns else self._planes)
             self._context.changed(wave, slice(0, LATENTS.columns.start), None, state)
 
-    def _predict(self, block: slice, rows: np.ndarray) -> None:
+    def _block(self, stream: Stream, block: slice, rows: np.ndarray, planes: int) -> None:
         if not len(rows):
             return
         found = self._context.predict(block, rows, self.state)
-        self.state.mean[rows, block] = np.clip(found.mean, -MEAN_LIMIT, MEAN_LIMIT)
-        self.state.scale[rows, block] = np.clip(found.scale, 0, HIGHEST_SCALE)
-        self.state.multiplier[rows, block] = found.multiplier
-        if self._choose is not None:
-            known = (getattr(self.state, name)[rows, block].astype(np.int64) for name in PARAMETERS)
-            self._chosen[rows, block] = self._choose(rows, block, Prediction(*known))
+        for part in PARTS[BLOCKS.index(block)]:
+            own = found.part(slice(part.start - block.start, part.stop - block.start))
+            more = self._context.moved(part, rows, self.state)
+            if more is not None:
+                own = Prediction(own.mean + more[0], own.scale + more[1], own.multiplier)
+            self._keep(part, rows, own)
+            self._code(stream, part, rows, planes)
 
-    def _code(self, stream: Stream, block: slice, rows: np.ndarray, planes: int) -> None:
-        wanted = self._coarse(rows, block, planes)
-        tables = table_levels(self.state.scale[rows, block], planes)
-        self.state.index[rows, block] = stream.indices(tables, wanted) * 3**planes
+    def _keep(self, columns: slice, rows: np.ndarray, found: Prediction) -> None:
+        self.state.mean[rows, columns] = np.clip(found.mean, -VALUE_LIMIT, VALUE_LIMIT)
+        self.state.scale[rows, columns] = np.clip(found.scale, 0, HIGHEST_SCALE)
+        self.state.multiplier[rows, columns] = found.multiplier
+
+    def _code(self, stream: Stream, part: slice, rows: np.ndarray, planes: int) -> None:
+        if self._choose is not None:
+            known = (getattr(self.state, name)[rows, part].astype(np.int64) for name in PARAMETERS)
+            self._chosen[rows, part] = self._choose(rows, part, Prediction(*known))
+        wanted = self._coarse(rows, part, planes)
+        tables = table_levels(self.state.scale[rows, part], planes)
+        self.state.index[rows, part] = stream.indices(tables, wanted) * 3**planes
 
     def _coarse(self, rows: np.ndarray, columns: slice, planes: int) -> np.ndarray | None:
         """What an encoder writes: its indices, coarser `planes` times."""
@@ -203,8 +220,7 @@ class Walk:
 
     def _view(self, stream: Stream, rows: np.ndarray) -> None:
         for wave in self._waves(rows):
-            self._predict(LATENTS.columns, wave)
-            self._code(stream, LATENTS.columns, wave, 0)
+            self._block(stream, LATENTS.columns, wave, 0)
             self.state.has_view[wave] = True
             self._context.changed(wave, LATENTS.columns, None, self.state)
 

@@ -22,6 +22,7 @@ from sw_wisp.numbers import BLOCKS, LATENTS, NUMBERS
 from sw_wisp.packets import Prediction, State
 from sw_wisp.pyramid import BASE, FEATURES, VIEW, WAVES, Pyramid
 from sw_wisp.static import MEAN_UNIT
+from sw_wisp.ties import moved, pack_ties, tied_parts, unpack_ties
 
 HIDDEN = (32, 48, 32, 40)
 STEPS_OF = ([0], [0] * 5 + [1], [0] * 3, [0] * 12)
@@ -43,11 +44,13 @@ class PyramidContext:
 
     prior       [22] int64, multiples of 16: means where nothing is known, base steps with 12 fractional bits
     layers      two of each network, exponents at least -12
+    ties        what known numbers of a block say of those behind, the same
     adaptive    whether steps follow the networks; else base steps
     """
 
     prior: np.ndarray
     layers: tuple[EightBitLayer, ...]
+    ties: tuple[EightBitLayer, ...]
     adaptive: bool = True
     _networks: list[IntegerMlp] = field(init=False, repr=False)
     _pyramid: Pyramid = field(init=False, repr=False)
@@ -81,6 +84,13 @@ class PyramidContext:
             multiplier = step_multipliers(out[:, 2 * width :])[:, STEPS_OF[number]]
         return Prediction(mean, out[:, width : 2 * width], multiplier)
 
+    def moved(self, part: slice, rows: np.ndarray, state: State) -> tuple[np.ndarray, np.ndarray] | None:
+        """What is added to the means and scales of a part, for those before it in its block."""
+        for tie, (tied, before) in zip(self.ties, tied_parts(), strict=True):
+            if tied == part:
+                return moved(tie, before, rows, state)
+        return None
+
     def changed(self, rows: np.ndarray, columns: slice, before: np.ndarray | None, state: State) -> None:
         """Take splats that became known, or finer, into the running means."""
         at, units = torch.from_numpy(rows), torch.from_numpy(state.units(rows, columns))
@@ -91,11 +101,12 @@ class PyramidContext:
             self._pyramid.add(at, part, units, torch.from_numpy(state.index[rows, columns].astype(np.int64)))
 
     def pack(self) -> bytes:
-        """Flags, prior, layers."""
+        """Flags, prior, layers, ties."""
         return (
             bytes([ADAPTIVE * self.adaptive])
             + (self.prior // MEAN_UNIT).astype("<i2").tobytes()
             + pack_layers(self.layers)
+            + pack_ties(self.ties)
         )
 
     @classmethod
@@ -106,10 +117,10 @@ class PyramidContext:
             raise BitstreamError(f"the context has flags {flags}, which are not known")
         prior = np.frombuffer(reader.take(2 * NUMBERS), "<i2").astype(np.int64) * MEAN_UNIT
         shapes = [shape for i, h, o in network_shapes() for shape in ((h, i, 1), (o, h, 1))]
-        layers = unpack_layers(reader, shapes)
+        layers, ties = unpack_layers(reader, shapes), unpack_ties(reader)
         if min(int(layer.exponents.min()) for layer in layers) < EXACT_EXPONENT:
             raise BitstreamError("a weight of the context is finer than its integers")
         try:
-            return cls(prior, layers, flags == ADAPTIVE)
+            return cls(prior, layers, ties, flags == ADAPTIVE)
         except ValueError as error:
             raise BitstreamError(f"the context networks cannot be used: {error}") from error

@@ -20,12 +20,11 @@ from torch import Tensor
 
 from sw_wisp.nested import UNIT
 from sw_wisp.numbers import HIGHEST_LEVEL, LATENTS, NUMBERS
-from sw_wisp.packets import REFINED, default_order, waves
+from sw_wisp.packets import REFINED, VALUE_LIMIT, default_order, waves
 
 DEEPEST = 15
 PULL = 2
 """Splats that the mean of the parent cell counts for."""
-VALUE_LIMIT = 1 << 20
 MOST_ACTIVE, MOST_COUNTED = 15, 15
 SIXTEENTH = UNIT // 16
 """Unit of activities, levels and counts."""

@@ -74,6 +74,9 @@ class StaticContext:
         means = self.means[at, block]
         return Prediction(means, self.tables[at, block] * UNIT, np.broadcast_to(self.multipliers[block], means.shape))
 
+    def moved(self, part: slice, rows: np.ndarray, state: State) -> None:
+        """Nothing: columns are independent."""
+
     def changed(self, rows: np.ndarray, columns: slice, before: np.ndarray | None, state: State) -> None:
         """Learn nothing from splats that were decoded."""
 
