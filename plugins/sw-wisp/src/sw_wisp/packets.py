@@ -89,8 +89,8 @@ class State:
 
     def units(self, rows: np.ndarray, columns: slice) -> np.ndarray:
         """Known values int64 [n,c] in base steps with 12 fractional bits."""
-        step = self.multiplier[rows, columns].astype(np.int64)
-        return self.mean[rows, columns] + self.index[rows, columns] * step
+        at = even(rows)
+        return self.mean[at, columns] + self.index[at, columns] * self.multiplier[at, columns].astype(np.int64)
 
 
 class Context(Protocol):
@@ -184,17 +184,19 @@ class Walk:
             self._code(stream, part, rows, planes)
 
     def _keep(self, columns: slice, rows: np.ndarray, found: Prediction) -> None:
-        self.state.mean[rows, columns] = np.clip(found.mean, -VALUE_LIMIT, VALUE_LIMIT)
-        self.state.scale[rows, columns] = np.clip(found.scale, 0, HIGHEST_SCALE)
-        self.state.multiplier[rows, columns] = found.multiplier
+        at = even(rows)
+        self.state.mean[at, columns] = np.clip(found.mean, -VALUE_LIMIT, VALUE_LIMIT)
+        self.state.scale[at, columns] = np.clip(found.scale, 0, HIGHEST_SCALE)
+        self.state.multiplier[at, columns] = found.multiplier
 
     def _code(self, stream: Stream, part: slice, rows: np.ndarray, planes: int) -> None:
         if self._choose is not None:
             known = (getattr(self.state, name)[rows, part].astype(np.int64) for name in PARAMETERS)
             self._chosen[rows, part] = self._choose(rows, part, Prediction(*known))
         wanted = self._coarse(rows, part, planes)
-        tables = table_levels(self.state.scale[rows, part], planes)
-        self.state.index[rows, part] = stream.indices(tables, wanted) * 3**planes
+        at = even(rows)
+        tables = table_levels(self.state.scale[at, part], planes)
+        self.state.index[at, part] = stream.indices(tables, wanted) * 3**planes
 
     def _coarse(self, rows: np.ndarray, columns: slice, planes: int) -> np.ndarray | None:
         """What an encoder writes: its indices, coarser `planes` times."""
@@ -228,6 +230,14 @@ class Walk:
         """Parts of the rows of one subset."""
         is_first = len(rows) > 0 and rows[0] == 0
         return waves(rows, self._context.waves[not is_first])
+
+
+def even(rows: np.ndarray) -> slice | np.ndarray:
+    """Rows as a slice, if they ascend evenly: a view of them takes no copy."""
+    if len(rows) < 2:
+        return rows
+    step = int(rows[1] - rows[0])
+    return slice(int(rows[0]), int(rows[-1]) + 1, step) if step > 0 and (np.diff(rows) == step).all() else rows
 
 
 def waves(rows: Any, count: int) -> list[Any]:

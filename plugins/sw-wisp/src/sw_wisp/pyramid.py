@@ -121,10 +121,11 @@ class Pyramid:
         if not len(rows):
             return
         self._own[part][rows, columns] += table.float()
-        at, sums = self._leaf[rows], self._sums[part][:, columns]
-        for _ in range(int(self._depth[at].amax()) + 1):
-            sums.index_add_(0, at, table)
-            at = self._parent[at]
+        cells = table.new_zeros(len(self._parent), table.shape[1]).index_add_(0, self._leaf[rows], table)
+        for level in range(DEEPEST, 0, -1):  # each cell's sum to its parent
+            own = slice(self._starts[level], self._starts[level + 1])
+            cells.index_add_(0, self._parent[own], cells[own].clone())
+        self._sums[part][:, columns] += cells
 
     def features(self, rows: Tensor) -> Tensor:
         """Features int64 [n,69] of some splats, 12 fractional bits."""
@@ -141,7 +142,8 @@ class Pyramid:
 
         fine, coarse = levels.clamp_max(DEEPEST), levels - 3
         cells, place = self._on_the_way(leaf)
-        means = [self._means(part, cells, place) for part in range(len(PARTS))]
+        limit = VALUE_LIMIT
+        means = [self._means(part, cells, place).clamp(-limit, limit).long() for part in range(len(PARTS))]
 
         def of(level: Tensor, activity: bool) -> list[Tensor]:
             at = place[around(level)]
@@ -149,12 +151,11 @@ class Pyramid:
             return [m[:, columns][at] for m, columns in zip(means, half, strict=True)]
 
         counts = [
-            (self._sums[0][around(level), -1] * (depth >= level)).clamp_max(MOST_COUNTED)[:, None] * SIXTEENTH
+            (self._sums[0][around(level), -1] * (depth >= level)).clamp_max(MOST_COUNTED)[:, None].long() * SIXTEENTH
             for level in (fine, coarse)
         ]
         found = [*of(fine, False), *of(coarse, False), *of((levels - 1).clamp_max(DEEPEST), True)]
-        found += [(levels * SIXTEENTH)[:, None], *counts]
-        return torch.cat([each.double() for each in found], dim=1).clamp_(-VALUE_LIMIT, VALUE_LIMIT).long()
+        return torch.cat([*found, (levels * SIXTEENTH)[:, None], *counts], dim=1)
 
     def _on_the_way(self, leaves: Tensor) -> tuple[Tensor, Tensor]:
         """Cells [m] that lie above or at some, ascending, and the place of each cell among them [cells + 1]."""

@@ -76,11 +76,13 @@ def log_covariance(log_scales: Tensor, quats: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def scales_and_quats(shape: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
-    """Return log scales [N,3], ascending, and unit quaternions [N,4] (w,x,y,z) of splats; by a library's eigen-solver.
+    """Return log scales [N,3], ascending, and unit quaternions [N,4] (w,x,y,z) of splats.
 
     Axes of equal scales are arbitrary: for the final export, not for anything that learns or is coded.
     """
-    values, vectors = torch.linalg.eigh(matrix_of(six_of(shape.double(), size.double())))
+    values, vectors = jacobi(six_of(shape.double(), size.double()))
+    values, order = values.sort(dim=1)
+    vectors = vectors.gather(2, order[:, None].expand(-1, 3, 3))
     vectors = vectors * torch.det(vectors).sign()[:, None, None]
     return values.to(size), _quaternions(vectors).to(size)
 

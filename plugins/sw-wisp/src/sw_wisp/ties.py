@@ -19,7 +19,7 @@ from sw_codecs.entropy.exact_tables import exact_tables
 from sw_wisp.eight_bits import EXACT_EXPONENT, HIGHEST_EXPONENT, LARGEST_WEIGHT, EightBitLayer
 from sw_wisp.nested import UNIT, table_levels
 from sw_wisp.numbers import BLOCKS, PARTS
-from sw_wisp.packets import VALUE_LIMIT, State
+from sw_wisp.packets import VALUE_LIMIT, State, even
 
 LARGEST_SIZE = 4
 ROUNDING = 1 / 12
@@ -43,9 +43,10 @@ def moved(tie: EightBitLayer, before: slice, rows: np.ndarray, state: State) -> 
 
     before  columns in its block that are known
     """
-    index = state.index[rows, before].astype(np.int64)
-    residuals = np.clip(index * state.multiplier[rows, before], -VALUE_LIMIT, VALUE_LIMIT)
-    tables = table_levels(state.scale[rows, before].astype(np.int64))
+    at = even(rows)
+    index = state.index[at, before].astype(np.int64)
+    residuals = np.clip(index * state.multiplier[at, before], -VALUE_LIMIT, VALUE_LIMIT)
+    tables = table_levels(state.scale[at, before])
     sizes = np.minimum(np.abs(index) * sizes_of_a_step()[tables], LARGEST_SIZE * UNIT)
     weights = np.ldexp(tie.weights.astype(np.float64), tie.exponents[:, None].astype(np.int64))
     half = len(weights) // 2
