@@ -12,7 +12,7 @@ from sw_wisp.numbers import LATENTS
 
 
 class Budget(Params):
-    """How many splats the training begins with; removal decides how many stay."""
+    """Number of splats that the training begins with; removal decides how many stay."""
 
     cap: int = Field(600_000, ge=1, description="most splats, times `budget.cap_factor`; half as many more may begin")
     cap_factor: float = Field(0.8, gt=0, le=10, description="what the rate points set")
@@ -44,7 +44,7 @@ class Steps(Params):
 
 
 class Context(Params):
-    """What predicts the numbers of a splat."""
+    """Prediction of the numbers of a splat."""
 
     kind: Literal["none", "pyramid"] = Field(
         "pyramid",
@@ -136,7 +136,7 @@ class Loss(Params):
 
 
 class Encode(Params):
-    """How the integers are fixed."""
+    """Choice of the integers at the end of a training."""
 
     rdoq: bool = Field(False, description="of each number the index of least loss and bits; else the nearest")
 

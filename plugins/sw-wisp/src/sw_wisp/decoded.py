@@ -1,4 +1,4 @@
-"""What a file holds: integers up to the hash point, and the floats that follow from them."""
+"""Contents of a file: integers up to the hash point, and the floats that follow from them."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ MOST_LAYERS, WIDEST = 16, 4096
 
 @dataclass(frozen=True)
 class Scene:
-    """What is coded; tensors on any device, rows in any order.
+    """Splats and settings to be coded; tensors on any device, rows in any order.
 
     cube        root of the octree
     levels      [N] int, 3..18, and `cells` [N,3] int at those levels, at most 16 splats in one
@@ -94,7 +94,7 @@ class Encoded:
 
 
 class Choice(Protocol):
-    """What an encoder writes for numbers: indices [n,c] int64 for the values `wanted` [n,c], 1/4096 base steps.
+    """Indices that an encoder writes for numbers: [n,c] int64 for the values `wanted` [n,c], 1/4096 base steps.
 
     rows of the scene, `columns` of the 22, and the distributions under which they are coded
     """

@@ -224,7 +224,7 @@ class WispModel(SplatModel):
 
     @torch.no_grad()
     def coded(self) -> Scene:
-        """What the file holds: of a trained model the integers that the training has fixed."""
+        """Contents of the file: of a trained model the integers that the training has fixed."""
         levels, cells = self.cube.settled(self.means, self.levels, self.opacity)
         values = self.numbers()
         values[:, SIZE.columns] += (self.log_edges(self.levels) - self.log_edges(levels))[:, None]

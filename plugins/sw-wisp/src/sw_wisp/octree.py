@@ -28,7 +28,7 @@ MOST_IN_A_CELL = 16
 
 @dataclass(frozen=True)
 class Cells:
-    """Where splats sit, in the order of the file.
+    """Cells of the splats, in the order of the file.
 
     levels  [N] int64, 3..18
     codes   [N] int64, Morton codes of their cells at that level, below 8^level
@@ -132,7 +132,7 @@ class _Truth:
         self.goes_on = self.inside > self.ending
 
     def holds(self, children: np.ndarray) -> np.ndarray:
-        """Which of the cells `children`, of this level, are occupied: bool in their shape."""
+        """Occupied cells among `children`, of this level: bool in their shape."""
         place = np.minimum(np.searchsorted(self.cells, children), len(self.cells) - 1)
         found: np.ndarray = self.cells[place] == children
         return found

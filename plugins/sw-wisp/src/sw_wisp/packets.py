@@ -94,7 +94,7 @@ class State:
 
 
 class Context(Protocol):
-    """What predicts numbers from the splats before them; `waves`: parts of the first packet and of every other."""
+    """Prediction of numbers from the splats before them; `waves`: parts of the first packet and of every other."""
 
     kind: str
     waves: tuple[int, int]
@@ -106,7 +106,7 @@ class Context(Protocol):
         """Distributions of the columns `block` of splats `rows`, all blocks before it known."""
 
     def moved(self, part: slice, rows: np.ndarray, state: State) -> tuple[np.ndarray, np.ndarray] | None:
-        """What parts of a block before it add to the means and scales [n,c] of `part`; None: nothing."""
+        """Additions of the parts of a block before it to the means and scales [n,c] of `part`; None: nothing."""
 
     def changed(self, rows: np.ndarray, columns: slice, before: np.ndarray | None, state: State) -> None:
         """Take note that `columns` of splats became known, or finer than `before` [n,c]."""
@@ -199,7 +199,7 @@ class Walk:
         self.state.index[at, part] = stream.indices(tables, wanted) * 3**planes
 
     def _coarse(self, rows: np.ndarray, columns: slice, planes: int) -> np.ndarray | None:
-        """What an encoder writes: its indices, coarser `planes` times."""
+        """Indices that an encoder writes, coarser `planes` times."""
         if self._choose is None:
             return None
         chosen = self._chosen[rows, columns].astype(np.int64)

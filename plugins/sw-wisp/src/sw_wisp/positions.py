@@ -1,4 +1,4 @@
-"""Which level of the octree a splat sits at."""
+"""Levels of splats in the octree."""
 
 from __future__ import annotations
 

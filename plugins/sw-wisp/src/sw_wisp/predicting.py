@@ -40,7 +40,7 @@ def network_shapes() -> list[tuple[int, int, int]]:
 
 @dataclass
 class PyramidContext:
-    """What the file holds.
+    """Contents of the file.
 
     prior       [22] int64, multiples of 16: means where nothing is known, base steps with 12 fractional bits
     layers      two of each network, exponents at least -12
@@ -85,7 +85,7 @@ class PyramidContext:
         return Prediction(mean, out[:, width : 2 * width], multiplier)
 
     def moved(self, part: slice, rows: np.ndarray, state: State) -> tuple[np.ndarray, np.ndarray] | None:
-        """What is added to the means and scales of a part, for those before it in its block."""
+        """Additions to the means and scales of a part, for those before it in its block."""
         for tie, (tied, before) in zip(self.ties, tied_parts(), strict=True):
             if tied == part:
                 return moved(tie, before, rows, state)

@@ -1,4 +1,4 @@
-"""What training draws in place of rounded numbers: noise, soft rounding, rounding with a straight-through gradient."""
+"""Stand-ins that training draws for rounded numbers: noise, soft rounding, rounding with a straight-through gradient."""
 
 from __future__ import annotations
 

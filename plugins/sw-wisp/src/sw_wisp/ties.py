@@ -39,7 +39,7 @@ def tie_shapes() -> list[tuple[int, int]]:
 
 
 def moved(tie: EightBitLayer, before: slice, rows: np.ndarray, state: State) -> tuple[np.ndarray, np.ndarray]:
-    """What a part of splats `rows` adds to its means and scale levels, int64 [n,c], 12 fractional bits.
+    """Additions to the means and scale levels of a part of splats `rows`, int64 [n,c], 12 fractional bits.
 
     before  columns in its block that are known
     """

@@ -1,4 +1,4 @@
-"""What each splat is worth to the pictures, in units of the loss."""
+"""Worth of each splat to the pictures, in units of the loss."""
 
 from __future__ import annotations
 
