@@ -36,6 +36,9 @@ ALLOWED = {
         "gives a file an age of two days",
     "splatwizard-native/tests/test_waiting.py::SPIN": "of a slow test",
     "splatwizard-native/tests/test_build_lock.py": "locks of one process, free or held: a limit of 0 s is the same",
+    "tests/forked_children.py::Forked": "a limit of 0 s asks without waiting",
+    "tests/test_forked_children.py::test_it_is_started_stopped_and_killed_as_any_process":
+        "the child waits for input that never comes",
     "splatwizard-core/tests/runs/test_measuring.py::test_repeats_leave_their_spread_in_the_record":
         "a mean lies between the least and the most of its own values",
     "splatwizard-core/tests/runs/test_measuring.py::test_loading_and_compiling_are_told_apart":

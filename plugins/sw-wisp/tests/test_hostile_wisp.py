@@ -5,7 +5,6 @@ A few hundred files in the default tests; more with `python -m pytest -m fuzz pl
 """
 
 import os
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -95,14 +94,12 @@ def test_every_length_is_refused(seeds):
 
 
 @pytest.mark.parametrize("rows", [2**31, 2**26, 2**20])
-def test_rows_that_bytes_cannot_hold_are_refused_at_once(seeds, rows):
+def test_rows_that_bytes_cannot_hold_are_refused_without_their_memory(seeds, rows):
     parts = Parts.of(seeds[0])
     parts.header["static"]["order"] = [[0, "base", rows], [0, "view", rows]]
     data, tally = parts.join(), Tally()
-    began = time.perf_counter()
     with pytest.raises(BitstreamError):
         file.decode(ContainerReader(data))
-    assert time.perf_counter() - began < 1
     attempt(lambda: decoded(data), "rows", NOISE, tally)
     assert tally.problems == []
 

@@ -326,10 +326,8 @@ def test_two_processes_that_want_the_same_scene_train_it_once(toy_plugins, tmp_p
     one = sw_train(
         first, tmp_path, TOY_DEATH="train:/checkpoints", TOY_SIGNAL=stop, TOY_WRITES=str(tmp_path / "writes")
     )
-    until = time.monotonic() + 300
     while psutil.Process(one.pid).status() != psutil.STATUS_STOPPED:
         assert one.poll() is None, one.communicate()
-        assert time.monotonic() < until
         time.sleep(0.01)
     two = sw_train("toy-taught", tmp_path)
     assert two.stderr is not None

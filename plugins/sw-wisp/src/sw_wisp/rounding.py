@@ -1,4 +1,4 @@
-"""Stand-ins that training draws for rounded numbers: noise, soft rounding, rounding with a straight-through gradient."""
+"""Stand-ins for rounded numbers in training: noise, soft rounding, rounding with a straight-through gradient."""
 
 from __future__ import annotations
 
