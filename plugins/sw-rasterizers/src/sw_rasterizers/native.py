@@ -40,7 +40,7 @@ MODULE = NativeModule(
             "csrc/cuda/binding_surfel_cuda.cpp",
             "csrc/cuda/binding_shared_cuda.cpp",
         ),
-        headers=("csrc/*.h", "csrc/cuda/*.h"),
+        headers=("csrc/*.h", "csrc/cuda/*.h", "csrc/cpu/simd.h"),
         cuda_sources=(
             "csrc/cuda/sort.cu",
             "csrc/cuda/blend_backward.cu",
