@@ -29,6 +29,16 @@ def test_cuda_sources_are_left_out_without_cuda_in_torch(package):
     assert module.state()["target"] == "cpu"
 
 
+def test_nothing_is_compiled_for_a_gpu_where_no_cuda_kernels_can_be_built(package, monkeypatch, caplog):
+    package.write("fill.cu", CUDA_KERNEL)
+    monkeypatch.setattr(cuda_toolkit, "toolkit_mismatch", lambda: "there is no toolkit")
+    module = package.module(cuda=package.module(cuda_sources=("fill.cu",)))
+    assert not module.has_cuda()
+    assert not module.has_cuda()
+    assert package.compilations == 0
+    assert caplog.messages == ["kernels 'answer' have no CUDA part: there is no toolkit; answers are guessed"]
+
+
 @needs_compiler
 @pytest.mark.skipif(cuda_toolkit.find_nvcc() is None, reason="no CUDA compiler on this machine")
 def test_cuda_sources_are_compiled_for_each_architecture(package, monkeypatch, tmp_path):

@@ -115,16 +115,17 @@ class NativeModule:
         return True
 
     def has_cuda(self) -> bool:
-        """Load, and say whether there are CUDA kernels; if not, warn once. For code that has a torch fallback."""
+        """Load CUDA kernels, and say whether there are such; if not, warn once. For code that has a torch fallback."""
         if self.cuda is not None:
             return self.cuda.has_cuda()
         session = self._session
         if session.cuda is None:
             if session.loaded is None and switched_off():
                 return False
-            session.cuda = self.try_load() and bool(architectures_of(session.loaded))
-            if not session.cuda and session.loaded is not None:
-                log.warning("kernels '%s' have no CUDA part: %s; %s", self.name, self._without_cuda(), self.without)
+            missing = self.available(cuda=True)  # asked first: a build without CUDA would be for nothing
+            session.cuda = missing is None and self.try_load() and bool(architectures_of(session.loaded))
+            if missing is not None and not session.warned:
+                log.warning("kernels '%s' have no CUDA part: %s; %s", self.name, missing, self.without)
         return session.cuda
 
     def load_built(self) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from splatwizard_native import NativeModule
+from splatwizard_native import NativeBuildError, NativeModule
 
 MODULE = NativeModule(
     name="sw_rasterizers",
@@ -40,7 +40,7 @@ MODULE = NativeModule(
             "csrc/cuda/binding_surfel_cuda.cpp",
             "csrc/cuda/binding_shared_cuda.cpp",
         ),
-        headers=("csrc/*.h", "csrc/cuda/*.h"),
+        headers=("csrc/*.h", "csrc/cuda/*.h", "csrc/cpu/simd.h"),
         cuda_sources=(
             "csrc/cuda/sort.cu",
             "csrc/cuda/blend_backward.cu",
@@ -70,8 +70,8 @@ def cuda_ops() -> Any:
     """Return the ops on CUDA. Raises NativeBuildError."""
     import torch  # here: what a package offers is told without it
 
-    assert MODULE.cuda is not None
-    MODULE.cuda.load()
+    if not MODULE.has_cuda():
+        raise NativeBuildError(str(unavailable_on_cuda()))
     return torch.ops.sw_rasterizers
 
 
