@@ -1,6 +1,6 @@
 """Native modules: C++ and CUDA sources that ship with a package, found prebuilt, cached, or compiled on first use.
 
-A module has a plain C face (docs/native.md), or registers ops with TORCH_LIBRARY: they are at torch.ops.<name>.
+A module has a plain C face (docs/native.md), or registers ops with TORCH_LIBRARY.
 Environment: SPLATWIZARD_CACHE (where builds go), SPLATWIZARD_NATIVE=0 (do without native code),
 SPLATWIZARD_BUILD_TIMEOUT (seconds to wait for another process's build), CXX, CUDA_HOME, TORCH_CUDA_ARCH_LIST (compute
 capabilities to build for, as "8.0;9.0"; without it those of the GPUs here), MAX_JOBS.
@@ -60,7 +60,7 @@ class _Session:
 class NativeModule:
     """One shared library, described by its sources.
 
-    name            also the TORCH_LIBRARY namespace: the ops are torch.ops.<name>.*; or what C functions begin with
+    name            of the library's file; what C functions of a face begin with
     package         import package whose folder the paths below are relative to
     sources         C++ files compiled once: the binding file, or what stands behind the face
     kernels         C++ files compiled once per instruction set, in `namespace SW_ARCH` (<splatwizard/dispatch.h>);
