@@ -119,14 +119,12 @@ class NativeModule:
         if self.cuda is not None:
             return self.cuda.has_cuda()
         session = self._session
-        if session.cuda is None:
-            if session.loaded is None and switched_off():
-                return False
+        if session.cuda is None and (session.loaded is not None or not switched_off()):
             missing = self.available(cuda=True)  # asked first: a build without CUDA would be for nothing
             session.cuda = missing is None and self.try_load() and bool(architectures_of(session.loaded))
             if missing is not None and not session.warned:
                 log.warning("kernels '%s' have no CUDA part: %s; %s", self.name, missing, self.without)
-        return session.cuda
+        return bool(session.cuda)
 
     def load_built(self) -> bool:
         """Load a build that is there already, and say whether there was one; compiles nothing.
