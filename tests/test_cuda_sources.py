@@ -18,7 +18,7 @@ NVCC = find_nvcc()
 
 
 def test_there_are_cuda_sources_to_compile():
-    assert {module.name for module, _ in SOURCES} >= {"sw_rasterizers"}
+    assert {module.name for module, _ in SOURCES} >= {"sw_rasterizers_cuda", "sw_codecs_cuda", "sw_anchors_cuda"}
 
 
 @pytest.mark.skipif(NVCC is None, reason="no CUDA compiler on this machine")

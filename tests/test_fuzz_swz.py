@@ -60,12 +60,17 @@ def blind_seeds():
         return [maker.encoded(name) for name in SEEDS if name != "3dgs_classes_v1"]
 
 
+def declared_count(static, name: str) -> int:
+    """The number of a model's rows as a header has it: by its name, or as the rows of the packets that bring some."""
+    return static[name] if name in static else sum(rows for _, kind, rows in static["order"] if kind == "base")
+
+
 def decode_file(path: Path):
     """What came of a file; an AssertionError if it decodes to nonsense."""
     model, reader = open_model(path, load_plugins(), CPU)
     reader.summary()
     # Fewer than declared where rows mean nothing: those are left out.
-    assert all(reader.static[name] >= number for name, number in model.counts().items())
+    assert all(declared_count(reader.static, name) >= number for name, number in model.counts().items())
     if "quantized" in (reader.static.get("mode"), str(reader.static.get("codec")).removeprefix("gaussians-")):
         assert all(bool(torch.isfinite(parameter).all()) for parameter in model.parameters())
     return "decoded"
@@ -83,7 +88,9 @@ def allowed_growth(data: bytes) -> int:
                                   log2_planes=log2[1])  # fmt: skip
             declared += 4 * static["num_anchors"] * (9 + static["feature_dim"] + 4 * static["num_offsets"])
         else:
-            declared = max(declared, static["num_gaussians"] * 4 * (14 + 3 * ((static["max_sh_degree"] + 1) ** 2 - 1)))
+            degree = static["max_sh_degree"] if "max_sh_degree" in static else static["sh_degree"]
+            numbers = 14 + 3 * ((degree + 1) ** 2 - 1) + (200 if "order" in static else 0)  # integers of wisp
+            declared = max(declared, declared_count(static, "num_gaussians") * 4 * numbers)
     return int(4 * min(max(declared, 0), decoded_limit(len(data)))) + NOISE
 
 

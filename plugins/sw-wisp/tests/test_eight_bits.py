@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import torch
 
 from splatwizard_core.api import BitstreamError
 from sw_codecs.bits.packing import ByteReader
@@ -22,9 +23,10 @@ def test_layers_return_and_are_exact_as_integers():
     for a, b in zip(layer.floats(), again.floats(), strict=True):
         assert np.array_equal(a, b)
     weight, bias = layer.floats()
-    weights, biases = IntegerMlp([(weight, bias)]).tensors()
-    assert np.array_equal(weights.numpy() / 4096, weight)
-    assert np.array_equal(biases.numpy() / 2**24, bias)
+    rows = np.vstack([np.zeros(48, np.int64), np.eye(48, dtype=np.int64) * 4096])  # 0, and 1 in one place each
+    found = IntegerMlp([(weight, bias)])(torch.from_numpy(rows)).numpy()
+    assert np.array_equal(found[0], np.round(bias * 4096))
+    assert np.array_equal(found[1:], np.round((weight.T + bias) * 4096))
 
 
 def test_the_error_is_half_a_unit_of_the_row():

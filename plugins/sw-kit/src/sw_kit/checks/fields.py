@@ -67,7 +67,7 @@ FIELDS: Mapping[str, Mapping[str, Rule]] = {
     "coder": {"codes": CODES, "available": WHERE, "stores": TEXT},
     "exporter": {"suffix": SUFFIX},
     "importer": {"suffix": SUFFIXED},
-    "command": {"position": NUMBER},
+    "command": {"position": NUMBER, "completes": FLAG},
     "check": {"group": TEXT, "needs": ANY},
     "dataset": {
         "looks_for": TEXT, "without_poses": TEXT, "title": TEXT, "scenes": NAMES, "table_scenes": NAMES,
