@@ -1,4 +1,4 @@
-"""Registers the method wisp."""
+"""Registers the method wisp and its entropy model."""
 
 from splatwizard_core.api import Registry, hookimpl
 
@@ -8,3 +8,9 @@ def register_methods(registry: Registry) -> None:
     registry.add("wisp", "sw_wisp.method:Wisp", title="Wisp",
                  summary="explicit splats coded as residuals against those before them, removed by their exact cost",
                  presets=["paper", "synthetic", "fast", "quick"], rates=["r1", "r2", "r3", "r4", "r5"])  # fmt: skip
+
+
+@hookimpl
+def register_entropy_models(registry: Registry) -> None:
+    registry.add("nested-gaussian", "sw_wisp.nested_model:NestedGaussian",
+                 summary="integers under Gaussians, at once or coarse first and refined later")  # fmt: skip
