@@ -1,4 +1,4 @@
-"""What the operations of the exact mode refuse before a kernel reads or writes beyond a tensor."""
+"""Refusals of the operations of the exact mode, before a kernel reads or writes beyond a tensor."""
 
 import numpy as np
 import pytest

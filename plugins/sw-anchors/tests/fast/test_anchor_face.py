@@ -1,4 +1,4 @@
-"""What the operations of anchors refuse, in Python and in C, before they read or write anything."""
+"""Refusals of the operations of anchors, in Python and in C, before they read or write anything."""
 
 import pytest
 import torch

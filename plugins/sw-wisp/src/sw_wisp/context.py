@@ -51,7 +51,7 @@ class Forecast(NamedTuple):
     steps: Tensor
 
     def part(self, columns: slice) -> Forecast:
-        """Those of some of the numbers."""
+        """Return the forecast of some numbers."""
         return Forecast(self.mean[:, columns], self.scale[:, columns], self.steps[:, columns])
 
 

@@ -49,7 +49,7 @@ class Prediction:
     multiplier: np.ndarray
 
     def part(self, columns: slice) -> Prediction:
-        """Those of some of the columns."""
+        """Return the prediction of some columns."""
         return Prediction(self.mean[:, columns], self.scale[:, columns], self.multiplier[:, columns])
 
 

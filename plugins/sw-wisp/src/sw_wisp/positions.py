@@ -12,7 +12,7 @@ from sw_wisp.shape import jacobi, six_of
 MARGIN = 0.1
 """Room around the splats while they still move, a share of their extent."""
 BITS_PER_LEVEL = 3.0
-"""What a finer level costs where cells are sparse: three bits that tell which of eight children."""
+"""Bits of a finer level where cells are sparse: which of eight children."""
 
 
 def middle_scales(shape: Tensor, size: Tensor) -> Tensor:

@@ -257,16 +257,17 @@ class PyramidRate(nn.Module):
     @torch.no_grad()
     def measure(self, splats: Placed, context: tuple[Tensor, ...]) -> dict[str, Tensor]:
         """Walk through the splats as a file would hold them now."""
-        forecast, drawn = self.networks(*context, splats.values, _rounded)
-        indices = ((drawn - forecast.mean) / forecast.steps).round()
-        return dict(zip(self.CONTEXT, self._features(splats, drawn / self.base_steps, indices), strict=True))
+        return self._walked(splats, context, _rounded)
 
     @torch.no_grad()
     def reread(self, splats: Placed, context: tuple[Tensor, ...]) -> dict[str, Tensor]:
         """Walk through splats whose numbers are those of the file."""
-        forecast, _ = self.networks(*context, splats.values)
-        indices = ((splats.values - forecast.mean) / forecast.steps).round()
-        return dict(zip(self.CONTEXT, self._features(splats, splats.values / self.base_steps, indices), strict=True))
+        return self._walked(splats, context, None)
+
+    def _walked(self, splats: Placed, context: tuple[Tensor, ...], draw: Draw | None) -> dict[str, Tensor]:
+        forecast, drawn = self.networks(*context, splats.values, draw)
+        indices = ((drawn - forecast.mean) / forecast.steps).round()
+        return dict(zip(self.CONTEXT, self._features(splats, drawn / self.base_steps, indices), strict=True))
 
     def _features(self, splats: Placed, units: Tensor, indices: Tensor) -> tuple[Tensor, Tensor]:
         return walked_features(self.networks.prior, splats.levels, splats.cells, units, indices)

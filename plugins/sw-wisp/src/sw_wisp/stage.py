@@ -41,7 +41,7 @@ from sw_wisp.positions import MARGIN, levels_by_cost, middle_scales
 from sw_wisp.rdoq import RateDistortion
 from sw_wisp.removal import copy_some, unworthy
 from sw_wisp.rounding import FINAL, HARD, NOISE, SOFT
-from sw_wisp.worth import Worth, slopes, worth
+from sw_wisp.worth import Worth, loss_of_error, slopes, worth
 
 NETWORKS = ("network", "rate")
 NETWORK_EPS = 1e-8
@@ -299,6 +299,10 @@ class WispStage(Stage):
         """Return what each splat is worth to all training views."""
         return worth(model, views, rasterizer, background, lambda_dssim=self.config.loss.lambda_dssim)
 
+    def loss_of_error(self, model: SplatModel, views: list[View], rasterizer: Rasterizer, background: Tensor) -> float:
+        """Return how much the loss of all training views rises with their squared error."""
+        return loss_of_error(model, views, rasterizer, background, lambda_dssim=self.config.loss.lambda_dssim)
+
     def tidy(self, model: WispModel) -> None:
         """Bring all numbers into the ranges that are kept."""
         for name, values in model.tidied().items():
@@ -313,10 +317,9 @@ class WispStage(Stage):
             levels = cube.levels(middle_scales(model.shape.detach(), model.size.detach()), rule.eta)
         else:
             draws = stream(model.split_seed, f"levels/{stream_name}")
-            some = [views[i] for i in torch.randperm(len(views), generator=draws)[:SENSITIVE_VIEWS].tolist()]
+            some = some_views(views, draws)
             squared = slopes(model, ["means"], some, rasterizer, background, draws)["means"].sum(1)
-            found = self.worth(model, views, rasterizer, background)
-            scale = found.loss_of_error * len(views) / len(some)
+            scale = self.loss_of_error(model, views, rasterizer, background) * len(views) / len(some)
             levels = levels_by_cost(squared.double() * scale, self.price(), cube.edge, rule.eta)
         model.levels = levels.clamp(rule.level_min, rule.level_max)
 
@@ -346,10 +349,8 @@ class WispStage(Stage):
         """Return the rise of the loss [N,22] float64 for each squared unit that a number is off."""
         draws = stream(model.split_seed, stream_name)
         squared = slopes(model, WispModel.NUMBERS, views, rasterizer, background, draws)
-        found = self.worth(model, views, rasterizer, background)
-        table = torch.cat([squared[name].flatten(1) if squared[name].dim() > 1 else squared[name][:, None]
-                           for name in WispModel.NUMBERS], dim=1)  # fmt: skip
-        return table.double() * found.loss_of_error
+        table = torch.cat([squared[name].reshape(model.num_rows, -1) for name in WispModel.NUMBERS], dim=1)
+        return table.double() * self.loss_of_error(model, views, rasterizer, background)
 
     def rate_distortion(
         self, model: WispModel, views: list[View], rasterizer: Rasterizer, background: Tensor
@@ -361,7 +362,7 @@ class WispStage(Stage):
     def set_latent_steps(self, model: WispModel, views: list[View], rasterizer: Rasterizer, background: Tensor) -> None:
         """Give each latent the step that makes its error in the pictures as large as that of the others."""
         draws, spread = stream(model.split_seed, "latents"), self.config.appearance.spread
-        some = [views[i] for i in torch.randperm(len(views), generator=draws)[:SENSITIVE_VIEWS].tolist()]
+        some = some_views(views, draws)
         weights = slopes(model, ["latents"], some, rasterizer, background, draws)["latents"].double().sum(0)
         logs = weights.clamp_min(1e-30).log()
         factors = ((logs.mean() - logs) / 2).exp().clamp(1 / spread, spread)
@@ -385,6 +386,11 @@ class WispStage(Stage):
             parts["bits"] = bits.detach()  # of a splat's 22 numbers
             total = total + price * n * bits
         return LossPack(total, parts)
+
+
+def some_views(views: list[View], draws: torch.Generator) -> list[View]:
+    """Draw the views that squared slopes are measured over."""
+    return [views[i] for i in torch.randperm(len(views), generator=draws)[:SENSITIVE_VIEWS].tolist()]
 
 
 @contextmanager

@@ -21,18 +21,11 @@ class Worth:
     """Exact costs of the removal of each splat alone, over some views.
 
     squared_error   [N] float64: how much the squared error rises; below 0: the pictures get better
-    total_error     squared error of the views as they are
-    loss            their mean photometric loss
+    loss_of_error   rise of their mean photometric loss for a rise of the squared error by 1
     """
 
     squared_error: Tensor
-    total_error: float
-    loss: float
-
-    @property
-    def loss_of_error(self) -> float:
-        """Rise of the loss for a rise of the squared error by 1, to first order: it goes with the error's root."""
-        return self.loss / max(2 * self.total_error, 1e-30)
+    loss_of_error: float
 
     @property
     def loss_rise(self) -> Tensor:
@@ -47,12 +40,25 @@ def worth(
     """Return what each splat is worth to all `views`."""
     device = background.device
     costs = removal_costs(lambda camera: model.gaussians(camera.to(device), rasterizer), views, rasterizer, background)
-    total, options = torch.zeros((), device=device), RasterOptions(background=background)
+    return Worth(costs.cost, loss_of_error(model, views, rasterizer, background, lambda_dssim=lambda_dssim))
+
+
+@torch.no_grad()
+def loss_of_error(
+    model: SplatModel, views: Sequence[View], rasterizer: Rasterizer, background: Tensor, *, lambda_dssim: float
+) -> float:
+    """Return how much the mean photometric loss of `views` rises with their squared error, to first order.
+
+    The loss goes with the root of the error.
+    """
+    device = background.device
+    squared, total, options = 0.0, torch.zeros((), device=device), RasterOptions(background=background)
     for view in views:
-        camera = view.camera.to(device)
+        camera, truth = view.camera.to(device), view.image(background, device)
         image = rasterizer.render(model.gaussians(camera, rasterizer), camera, options).image
-        total += photometric_loss(image, view.image(background, device), lambda_dssim=lambda_dssim).total
-    return Worth(costs.cost, costs.squared_error, total.item() / len(views))
+        squared += float((image - truth).double().square().sum())
+        total += photometric_loss(image, truth, lambda_dssim=lambda_dssim).total
+    return total.item() / len(views) / max(2 * squared, 1e-30)
 
 
 def slopes(
