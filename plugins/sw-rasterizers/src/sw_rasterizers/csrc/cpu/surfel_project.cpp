@@ -161,26 +161,8 @@ struct ChunkProjection : SurfelProjector<V> {
 template <class V>
 int64_t project_all(const View<Scalar<V>>& view, const Gaussians<Scalar<V>>& g, const Settings& settings,
                     const Slots<Scalar<V>>& slots, Scalar<V>* planes, int32_t* radii, int64_t* counts) {
-  const int64_t chunks = (g.count + kChunk - 1) / kChunk;
   const ChunkProjection<V> project_chunk{{view, g, settings}, slots, planes, radii};
-  std::atomic<int64_t> next{0}, visible{0}, invalid{0}, listed{0};
-  parallel(settings.parallel, [&] {
-    TileList tiles;
-    for (int64_t chunk; (chunk = next.fetch_add(1, std::memory_order_relaxed)) < chunks;) {
-      int64_t bad = 0;
-      tiles.start(slots.room - listed);
-      project_chunk(chunk, tiles, &bad);
-      tiles.keep(chunk, listed, slots);
-      const int32_t* first = radii + chunk * kChunk;
-      visible += std::count_if(first, first + std::min<int64_t>(kChunk, g.count - chunk * kChunk),
-                               [](int32_t radius) { return radius > 0; });
-      invalid += bad;
-    }
-  });
-  counts[0] = visible, counts[1] = invalid, counts[2] = listed;
-  int64_t used = 0;
-  for (int64_t chunk = 0; chunk < chunks; ++chunk) used += slots.per_chunk[chunk];
-  return used;
+  return project_chunks(settings.parallel, g.count, slots, radii, counts, project_chunk);
 }
 
 template <class V>

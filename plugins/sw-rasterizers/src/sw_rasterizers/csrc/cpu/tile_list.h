@@ -7,6 +7,7 @@
 
 #include "../tiles.h"
 #include "kernels.h"
+#include "parallel.h"
 
 namespace SW_ARCH {
 using namespace sw;
@@ -32,6 +33,32 @@ struct TileList {
     if (at + listed <= slots.room) std::copy(tiles.begin(), tiles.end(), slots.tiles + at);
   }
 };
+
+// Projects `count` Gaussians or surfels by project_chunk(chunk, tiles, &invalid), kChunk at a time. Writes how many are
+// visible, not finite, and pairs with tiles to counts; returns the slots used.
+template <class S, class ProjectChunk>
+int64_t project_chunks(const splatwizard::Parallel* threads, int64_t count, const Slots<S>& slots, const int32_t* radii,
+                       int64_t* counts, const ProjectChunk& project_chunk) {
+  const int64_t chunks = (count + kChunk - 1) / kChunk;
+  std::atomic<int64_t> next{0}, visible{0}, invalid{0}, listed{0};
+  parallel(threads, [&] {
+    TileList tiles;
+    for (int64_t chunk; (chunk = next.fetch_add(1, std::memory_order_relaxed)) < chunks;) {
+      int64_t bad = 0;
+      tiles.start(slots.room - listed);
+      project_chunk(chunk, tiles, &bad);
+      tiles.keep(chunk, listed, slots);
+      const int32_t* first = radii + chunk * kChunk;
+      visible += std::count_if(first, first + std::min<int64_t>(kChunk, count - chunk * kChunk),
+                               [](int32_t radius) { return radius > 0; });
+      invalid += bad;
+    }
+  });
+  counts[0] = visible, counts[1] = invalid, counts[2] = listed;
+  int64_t used = 0;
+  for (int64_t chunk = 0; chunk < chunks; ++chunk) used += slots.per_chunk[chunk];
+  return used;
+}
 
 // From a record's ellipse, as far as accept(tile_x, tile_y) agrees, or from the square of `radius` around (u, v) that
 // 3DGS takes. Returns how many.
