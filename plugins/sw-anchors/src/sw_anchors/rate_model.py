@@ -11,6 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Protocol, TypeAlias
 
+import torch
 from torch import Tensor
 
 from sw_anchors.fast import sample_bits
@@ -25,6 +26,8 @@ Rows: TypeAlias = "Tensor | slice"
 
 SMALLEST_SCALE = 1e-9
 """Lower bound of a predicted standard deviation, as published."""
+REACH = 5.0
+"""Predicted deviations that a number is away from its mean at most, where `Floors.scale` is set."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +51,9 @@ class Floors:
     """Lower bounds in the training rate.
 
     probability     of a value
-    scale           of a predicted deviation, in quantiser steps; below it a gradient passes that would raise it.
-                    0: SMALLEST_SCALE in units of the values, below which there is no gradient
+    scale           of a predicted deviation, in quantiser steps; below it a gradient passes that would raise it, and
+                    no number is more than REACH deviations from its mean. 0: SMALLEST_SCALE in units of the values,
+                    below which there is no gradient
     """
 
     probability: float = 1e-6
@@ -135,7 +139,7 @@ def gaussian_rate(
     The derivative by the bits must not be negative.
     """
     if floors.scale:
-        scale = floored(scale, _shape(values, masks).widened(steps), floors)
+        scale = floored(scale, _shape(values, masks).widened(steps), values - mean, floors)
     count = sample_bits.bits_of if sample_bits.fits(values, mean, scale, steps, masks, counted) else bits_of
     return count(values, mean, scale, steps, masks, counted, floors.probability, SMALLEST_SCALE)
 
@@ -166,13 +170,17 @@ def _shape(values: Tensor, masks: Tensor) -> AnchorShape:
     return AnchorShape(values.shape[1] - 6 - 3 * k, k)
 
 
-def floored(scale: Tensor, steps: Tensor, floors: Floors) -> Tensor:
-    """Clamp predicted standard deviations [S,C] from below, for quantiser steps [S,C]; differentiable.
+def floored(scale: Tensor, steps: Tensor, offsets: Tensor, floors: Floors) -> Tensor:
+    """Clamp predicted standard deviations [S,C] from below; differentiable in `scale` alone.
 
-    A deviation at SMALLEST_SCALE has no gradient: a column that starts there for all anchors never learns.
+    A deviation at SMALLEST_SCALE has no gradient, nor has a mean many deviations away from a number: a column that is
+    there for all anchors never learns, and costs some 20 bits a number.
+
+    steps       [S,C] quantiser steps
+    offsets     [S,C] of the numbers from their means
     """
     if floors.scale:
-        return lower_bound(scale, floors.scale * steps.detach())
+        return lower_bound(scale, torch.maximum(floors.scale * steps, offsets.abs() / REACH).detach())
     return scale.clamp(min=SMALLEST_SCALE)
 
 

@@ -64,18 +64,20 @@ class HACPlusRateModel(HACRateModel):
         """Return bits [S,C] of noisy values under the grid's Gaussians, of features under the mixture of both."""
         found, f, smallest = self.read(forecast.outputs), self.shape.features, self.floors.probability
         mean, steps = torch.cat(found.means, dim=1), self.shape.widened(forecast.sample_steps)
-        scale = floored(torch.cat(found.scales, dim=1), steps, self.floors)
+        scale = floored(torch.cat(found.scales, dim=1), steps, values - mean, self.floors)
         if self.channel is None:
             return rates.gaussian_bits(values, mean, scale, steps, p_min=smallest)
         base = self.base_steps[0]
         logit = forecast.outputs[:, sum(self.shape.outputs) :]
         inputs = torch.cat([found.means[0] / base, found.scales[0] / base, logit], dim=1)
         second_mean, second_scale, second_logit = self.channel(values[:, :f] / base, inputs)
+        second_mean = base * second_mean
+        second_scale = floored(base * second_scale, steps[:, :f], values[:, :f] - second_mean, self.floors)
         features = further_rates.mixture_bits(
             values[:, :f],
             torch.stack([logit, second_logit], dim=-1),
-            torch.stack([mean[:, :f], base * second_mean], dim=-1),
-            torch.stack([scale[:, :f], floored(base * second_scale, steps[:, :f], self.floors)], dim=-1),
+            torch.stack([mean[:, :f], second_mean], dim=-1),
+            torch.stack([scale[:, :f], second_scale], dim=-1),
             steps[:, :f],
             p_min=smallest,
         )

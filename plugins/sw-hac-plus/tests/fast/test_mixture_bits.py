@@ -53,12 +53,13 @@ def by_torch(x, outputs, steps, masks, counted, predicted, channel):
     parts = outputs[:, : 2 * x.shape[1]].split([f, f, 6, 6, 3 * k, 3 * k], dim=1)
     wide = steps.repeat_interleave(torch.tensor([f, 6, 3 * k], device=x.device), dim=1)
 
-    def floored(scale, steps):
+    def floored(scale, steps, offsets):
         if predicted.scale_floor:
-            return rates.lower_bound(scale, predicted.scale_floor * steps.detach())
+            return rates.lower_bound(scale, torch.maximum(predicted.scale_floor * steps, offsets.abs() / 5).detach())
         return scale.clamp(min=predicted.smallest_scale)
 
-    mean, scale = torch.cat(parts[0::2], dim=1), floored(torch.cat(parts[1::2], dim=1), wide)
+    mean = torch.cat(parts[0::2], dim=1)
+    scale = floored(torch.cat(parts[1::2], dim=1), wide, x - mean)
     bits = rates.gaussian_bits(x, mean, scale, wide, p_min=predicted.smallest)
     if channel is not None:
         base, logit = predicted.base, outputs[:, -f:]
@@ -68,7 +69,7 @@ def by_torch(x, outputs, steps, masks, counted, predicted, channel):
             x[:, :f],
             torch.stack([logit, second_logit], -1),
             torch.stack([mean[:, :f], base * second_mean], -1),
-            torch.stack([scale[:, :f], floored(base * second_scale, wide[:, :f])], -1),
+            torch.stack([scale[:, :f], floored(base * second_scale, wide[:, :f], x[:, :f] - base * second_mean)], -1),
             wide[:, :f],
             p_min=predicted.smallest,
         )

@@ -23,7 +23,7 @@ enum MaskKind { kAlone, kGated, kGatedMean };
 struct MixtureBounds {
   float smallest;        // probability
   float smallest_scale;  // of a deviation, if there is no floor in steps: no gradient below
-  float scale_floor;     // of a deviation, in steps; 0: none. A gradient that raises the deviation passes
+  float scale_floor;     // of a deviation, in steps, and see REACH; 0: none. A gradient that raises the deviation passes
 };
 
 // Of S anchors, F features, k offsets. A row of `outputs` has means and deviations of features, then of 6 scales, then
@@ -123,10 +123,16 @@ struct Normal {
   Real mean, scale;
 };
 
-// The floor of a deviation.
+// The floor of a deviation, for a number `offset` from the mean: with a floor in steps a number is at most REACH
+// deviations away, since beyond that its gradient falls to 0, and a column that is there for all anchors stays there.
+constexpr float REACH = 5.f;  // sw_anchors.rate_model.REACH
+
 template <class Math, class Real = typename Math::Real>
-SW_MIXTURE_HD Real least_scale(Real step, const MixtureBounds& bounds) {
-  return bounds.scale_floor > 0.f ? Math::number(bounds.scale_floor) * step : Math::number(bounds.smallest_scale);
+SW_MIXTURE_HD Real least_scale(Real step, Real offset, const MixtureBounds& bounds) {
+  if (!(bounds.scale_floor > 0.f)) return Math::number(bounds.smallest_scale);
+  const Real in_steps = Math::number(bounds.scale_floor) * step, zero = Math::number(0.f);
+  const Real in_reach = Math::number(1.f / REACH) * (offset < zero ? -offset : offset);
+  return in_steps < in_reach ? in_reach : in_steps;
 }
 
 template <class Math, class Real = typename Math::Real>
@@ -158,7 +164,7 @@ SW_MIXTURE_HD Real slope_of_probability(Real factor, Real probability) {
 template <class Math, class Real = typename Math::Real>
 SW_MIXTURE_HD OneBits<Math> one_bits(Real x, Real step, Real factor, const Normal<Math>& first,
                                      const MixtureBounds& bounds) {
-  const Real least = least_scale<Math>(step, bounds);
+  const Real least = least_scale<Math>(step, x - first.mean, bounds);
   const BinMass<Math> mass = bin_mass<Math>(x, first.mean, bounded_below<Math>(first.scale, least), step);
   const Real p = bounded_below<Math>(mass.value, Math::number(bounds.smallest));
   const Real slope = slope_of_probability<Math>(factor, p), by_x = slope * mass.by_x;
@@ -177,9 +183,11 @@ struct TwoBits {
 template <class Math, class Real = typename Math::Real>
 SW_MIXTURE_HD TwoBits<Math> two_bits(Real x, Real step, Real factor, const Normal<Math>& first,
                                      const Normal<Math>& second, Real logit, const MixtureBounds& bounds) {
-  const Real zero = Math::number(0.f), one = Math::number(1.f), least = least_scale<Math>(step, bounds);
-  const BinMass<Math> a = bin_mass<Math>(x, first.mean, bounded_below<Math>(first.scale, least), step);
-  const BinMass<Math> b = bin_mass<Math>(x, second.mean, bounded_below<Math>(second.scale, least), step);
+  const Real zero = Math::number(0.f), one = Math::number(1.f);
+  const Real least_a = least_scale<Math>(step, x - first.mean, bounds);
+  const Real least_b = least_scale<Math>(step, x - second.mean, bounds);
+  const BinMass<Math> a = bin_mass<Math>(x, first.mean, bounded_below<Math>(first.scale, least_a), step);
+  const BinMass<Math> b = bin_mass<Math>(x, second.mean, bounded_below<Math>(second.scale, least_b), step);
   // Both weights from the exponential that cannot overflow, so that the small one is as precise as the large one.
   const Real tail = Math::exponential(logit < zero ? logit : -logit), large = one / (one + tail), small = tail * large;
   const Real weight = logit < zero ? small : large, other = logit < zero ? large : small;
@@ -189,8 +197,8 @@ SW_MIXTURE_HD TwoBits<Math> two_bits(Real x, Real step, Real factor, const Norma
   return {p,
           by_a + by_b,
           to_a * a.by_step + to_b * b.by_step,
-          {-by_a, through_floor<Math>(to_a * a.by_deviation, first.scale, least, bounds)},
-          {-by_b, through_floor<Math>(to_b * b.by_deviation, second.scale, least, bounds)},
+          {-by_a, through_floor<Math>(to_a * a.by_deviation, first.scale, least_a, bounds)},
+          {-by_b, through_floor<Math>(to_b * b.by_deviation, second.scale, least_b, bounds)},
           to_a * other * (a.value - b.value)};
 }
 
