@@ -124,6 +124,19 @@ def test_what_a_plan_says_of_all_methods_also_trains_what_they_start_from(tmp_pa
     assert "lightgaussian: the trained scene that it starts from has iterations=20 too" in capsys.readouterr().err
 
 
+def test_trainings_for_several_have_names_of_their_own(tmp_path):
+    """A job goes by its name, and so does the file of its output."""
+    overrides = [
+        {"methods": [label], "set": {**SHORT, "pretrained.iterations": steps}}
+        for steps, labels in ((10, ("a", "b")), (20, ("c", "d"))) for label in labels
+    ]  # fmt: skip
+    method = {label: {"method": "lightgaussian"} for label in "abcd"}
+    _, jobs, _ = planned(tmp_path, methods=[*"abcd"], method=method, override=overrides)
+    names = [job.name for job in jobs]
+    assert len(set(names)) == len(names)
+    assert {f"3dgs demo:tiny seed 0 (training for several) {n} of 2" for n in (1, 2)} < set(names)
+
+
 def test_a_finished_training_for_several_is_no_process_to_go(tmp_path):
     _, jobs, _ = planned(tmp_path, methods=["3dgs", "lightgaussian"], set={"iterations": 20})
     shared = jobs[0].shared

@@ -14,7 +14,7 @@ from splatwizard_core.runs.config import apply_overrides
 from splatwizard_core.tooling import NegotiatedRasterizer
 from sw_wisp.config import WispConfig
 from sw_wisp.method import Wisp
-from sw_wisp.rate_model import StaticRate
+from sw_wisp.rate_model import Placed, StaticRate
 from sw_wisp.shape import covariance, jacobi
 
 pytestmark = pytest.mark.cuda
@@ -29,8 +29,9 @@ def test_covariances_and_their_gradients_are_those_of_the_cpu():
         cov = covariance(leaf[:, :5], leaf[:, 5], -9.0, 3.0)
         (cov * weight.to(device)).sum().backward()
         found.append((cov.detach().cpu(), leaf.grad.cpu()))
-    for ours, theirs in zip(*found, strict=True):
-        assert torch.allclose(ours, theirs, rtol=1e-4, atol=1e-4)
+    for ours, theirs in zip(*found, strict=True):  # covariances reach e^6, their gradients more
+        assert float((ours - theirs).norm(dim=1).max()) <= 1e-4 * float(ours.norm(dim=1).max())
+        assert torch.allclose(ours, theirs, rtol=1e-2, atol=1e-3 * float(ours.abs().max()))
 
 
 def test_jacobi_does_not_wait_for_the_device():
@@ -46,9 +47,10 @@ def test_measured_tables_are_those_of_the_cpu():
     draws = torch.Generator().manual_seed(0)
     values = torch.randn(4_000, 22, generator=draws)
     levels = torch.randint(5, 12, (4_000,), generator=draws)
+    cells = torch.zeros(4_000, 3, dtype=torch.int64)
     rates = [StaticRate(torch.full((22,), 0.3)).to(device) for device in ("cpu", "cuda")]
     for each, device in zip(rates, ("cpu", "cuda"), strict=True):
-        each.measure(values.to(device), levels.to(device))
+        each.measure(Placed(values.to(device), levels.to(device), cells.to(device)), (levels.to(device),))
     assert torch.equal(rates[0].row, rates[1].row.cpu())
     assert (rates[0].means - rates[1].means.cpu()).abs().max() <= 16  # sums in another order
     assert (rates[0].tables != rates[1].tables.cpu()).float().mean() < 0.01

@@ -240,12 +240,15 @@ def test_a_tiny_scene_gets_the_quick_plan_unless_something_else_is_asked_for(ope
 
 def test_values_by_data_set_are_told_once_for_each_method(opened):
     def found(preset):
-        by_data_set = [replace(resolved(rate=r), method=m, provenance={"steps": "data set 'db'"})
+        sources = dict.fromkeys(("steps", "pretrained.density.cap"), "data set 'db'")
+        by_data_set = [replace(resolved(rate=r), method=m, provenance=sources, pretrained={"density.cap": 7})
                        for m in ("one", "other") for r in ("r1", "r2")]  # fmt: skip
         return [resolved(preset="paper"), *by_data_set]
 
     _, told = opened(found)
-    assert told[-3:] == ["one, by data set: steps = [1, 2]", "other, by data set: steps = [1, 2]", "on the CPU"]
+    assert told[-3:] == [
+        *(f"{m}, by data set: steps = [1, 2], pretrained.density.cap = 7" for m in ("one", "other")), "on the CPU"
+    ]  # fmt: skip
     assert not any("by data set" in line for line in told[:-3])
     _, told = opened(lambda preset: [resolved(preset=preset)] if preset else found(preset), side=100)
     assert not any("by data set" in line for line in told)

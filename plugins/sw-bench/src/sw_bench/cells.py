@@ -244,6 +244,10 @@ def jobs_of(cells: Sequence[Cell], layout: Layout, plugins: PluginManager) -> li
             wanted.setdefault(key, []).append(each)
         needs.append(keys)
     shared = {key: _shared_job(key, who[0], layout) for key, who in wanted.items() if len(who) > 1}
+    for name, count in Counter(job.name for job in shared.values()).items():
+        if count > 1:  # a job goes by its name
+            for number, job in enumerate([job for job in shared.values() if job.name == name], 1):
+                job.name = f"{name} {number} of {count}"
     for key, job in shared.items():
         bases = [(key[0], training_key(each)) for each in _bases(wanted[key][0], plugins)]
         job.needs = tuple(shared[each] for each in bases if each in shared)

@@ -12,8 +12,8 @@ from splatwizard_core.api import GaussianModel
 from sw_wisp.appearance import AppearanceNetwork, colour_of
 from sw_wisp.cube import Cube
 from sw_wisp.model import WispModel
-from sw_wisp.numbers import LATENTS, LOWEST_LEVEL
-from sw_wisp.positions import MARGIN
+from sw_wisp.numbers import LATENTS
+from sw_wisp.positions import MARGIN, middle_scales
 from sw_wisp.rate_model import PyramidRate, StaticRate
 from sw_wisp.shape import log_covariance
 from sw_wisp.worth import slopes, worth
@@ -24,6 +24,12 @@ if TYPE_CHECKING:
 
 HEAD_ROOM = 1.5
 """Splats that may begin, in caps: removal takes the rest while it trains."""
+FAR_SHARE = 1e-4
+"""Of the worth of all splats: what may lie beyond the root cube, and goes. MCMC throws some splats a thousand rooms away,
+where nobody sees them, and cells are a 2^18th of the cube at the finest."""
+WIDEST_RATIO = 9.7
+"""Largest difference of log scales that begins: the deviator's coordinates stay within their limit. A thinner splat
+looks the same."""
 
 
 def kept_rows(costs: Tensor, config: WispConfig) -> Tensor:
@@ -38,6 +44,19 @@ def kept_rows(costs: Tensor, config: WispConfig) -> Tensor:
     return torch.sort(costs, descending=True, stable=True).indices[:keep].sort().values
 
 
+def within_reach(means: Tensor, costs: Tensor) -> Tensor:
+    """Tell [N] which splats lie within twice the distance from their middle that holds all but FAR_SHARE of the worth.
+
+    means   [N,3]
+    costs   [N] of removal; below 0 they count as 0
+    """
+    away = (means - means.median(dim=0).values).abs().amax(dim=1)
+    order = torch.sort(away, stable=True).indices
+    worth = costs.double().clamp_min(0)[order].cumsum(0)
+    reach = int(torch.searchsorted(worth, (1 - FAR_SHARE) * worth[-1:]))
+    return away <= 2 * away[order[min(reach, len(order) - 1)]]
+
+
 def converted(
     model: GaussianModel,
     views: Sequence[View],
@@ -46,13 +65,14 @@ def converted(
     config: WispConfig,
     generator: torch.Generator,
 ) -> WispModel:
-    """Return the splats of a trained scene, at level 3 all of them; the stage sets levels by its rule.
+    """Return the splats of a trained scene, at levels by their size.
 
     generator   of random signs and of the network's first weights, on the CPU
     """
     model.active_sh_degree = model.max_sh_degree
     found = worth(model, views, rasterizer, background, lambda_dssim=config.loss.lambda_dssim)
     rows = kept_rows(found.squared_error, config)
+    rows = rows[within_reach(model.means.detach()[rows], found.squared_error[rows])]
     network = AppearanceNetwork(
         LATENTS.width, config.appearance.hidden, max(model.max_sh_degree, 1), generator=generator
     ).to(background.device)
@@ -62,14 +82,18 @@ def converted(
             latents = network.fit(model.sh_rest[rows], weights[rows])
         else:
             latents = model.means.new_zeros(len(rows), LATENTS.width)
-        shape, size = log_covariance(model.log_scales.double(), model.quats.double())
+        logs = model.log_scales[rows].double()
+        shape, size = log_covariance(
+            torch.maximum(logs, logs.amax(dim=1, keepdim=True) - WIDEST_RATIO), model.quats[rows].double()
+        )
         means = model.means[rows].detach()
+        cube = Cube.around(means, margin=MARGIN)
         steps = torch.tensor(config.base_steps)
         rate: StaticRate | PyramidRate = StaticRate(steps)
         if config.context.kind == "pyramid":
             rate = PyramidRate(steps, adaptive=config.steps.adaptive, generator=generator)
         return WispModel(
-            means, model.opacity_logits[rows], shape[rows], size[rows], colour_of(model.sh_dc)[rows], latents,
-            torch.full((len(rows),), LOWEST_LEVEL, device=background.device), cube=Cube.around(means, margin=MARGIN),
+            means, model.opacity_logits[rows], shape, size, colour_of(model.sh_dc)[rows], latents,
+            cube.levels(middle_scales(shape, size), config.positions.eta), cube=cube,
             network=network, rate=rate.to(background.device), sharpest=config.phases.sharpness,
         )  # fmt: skip

@@ -82,7 +82,7 @@ class Pyramid:
 
     def _find_cells(self) -> None:
         """Cells of two splats or more, by level and code; their parents; the finest of them around each splat."""
-        order = torch.argsort(self._codes)
+        order = torch.argsort(self._codes, stable=True)
         codes, levels = self._codes[order], self._levels[order].clamp_max(DEEPEST)
         keys, starts = [codes.new_ones(min(len(codes), 1))], [0, min(len(codes), 1)]
         self._leaf = torch.zeros_like(codes)
@@ -214,7 +214,7 @@ def walked_features(
     First the features of opacity, shape, size and colour, then those of latents. All tensors on one device.
     """
     codes = interleave(cells)
-    by_place = torch.argsort((codes << 3 * (HIGHEST_LEVEL - levels)) * 32 + levels)
+    by_place = torch.argsort((codes << 3 * (HIGHEST_LEVEL - levels)) * 32 + levels, stable=True)
     labels = torch.zeros_like(levels) if labels is None else labels
     order = order or default_order(int(labels.max()) + 1 if len(labels) else 1, planes)
     units = (values.double() * UNIT).round()

@@ -218,7 +218,7 @@ def tell_data_set_values(found: Sequence[ResolvedConfig], tell: Callable[[str], 
     from splatwizard_core.training.keys import dotted
 
     for each in reversed({each.method: each for each in reversed(found)}.values()):
-        values = dotted(each.config.model_dump() | each.scene_options, "")
+        values = dotted(each.config.model_dump() | each.scene_options, "") | dotted(each.pretrained, "pretrained.")
         told = [f"{k} = {values[k]}" for k, source in each.provenance.items() if source.startswith("data set ")]
         if told:
             tell(f"{each.method}, by data set: {', '.join(told)}")
