@@ -1,9 +1,9 @@
 """The start from a trained scene: what few splats at the end of the world, and very thin ones, do to all others."""
 
 import torch
+from sw_reference.rasterizer import ReferenceRasterizer
 
 from splatwizard_core.api import Camera, GaussianModel, RasterOptions, View
-from sw_reference.rasterizer import ReferenceRasterizer
 from sw_wisp.config import WispConfig
 from sw_wisp.conversion import FAR_SHARE, converted, within_reach
 

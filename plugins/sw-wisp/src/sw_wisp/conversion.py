@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 HEAD_ROOM = 1.5
 """Splats that may begin, in caps: removal takes the rest while it trains."""
 FAR_SHARE = 1e-4
-"""Of the worth of all splats: what may lie beyond the root cube, and goes. MCMC throws some splats a thousand rooms away,
-where nobody sees them, and cells are a 2^18th of the cube at the finest."""
+"""Of the worth of all splats: what may lie beyond the root cube, and goes. MCMC throws some splats a thousand rooms
+away, where nobody sees them, and cells are a 2^18th of the cube at the finest."""
 WIDEST_RATIO = 9.7
 """Largest difference of log scales that begins: the deviator's coordinates stay within their limit. A thinner splat
 looks the same."""
