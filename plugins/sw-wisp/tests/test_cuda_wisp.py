@@ -25,7 +25,7 @@ def test_covariances_and_their_gradients_are_those_of_the_cpu():
     numbers, weight = torch.randn(5_000, 6, generator=draws), torch.randn(5_000, 6, generator=draws)
     found = []
     for device in ("cpu", "cuda"):
-        leaf = numbers.to(device).requires_grad_()
+        leaf = numbers.to(device, copy=True).requires_grad_()
         cov = covariance(leaf[:, :5], leaf[:, 5], -9.0, 3.0)
         (cov * weight.to(device)).sum().backward()
         found.append((cov.detach().cpu(), leaf.grad.cpu()))
