@@ -79,8 +79,6 @@ def test_the_page_names_every_function_and_importing_them_is_light():
         "run", "train", "encode", "decode", "load_scene", "evaluate", "render",
     ]  # fmt: skip
     assert sorted(sw.__all__) == sorted(re.findall(r"^\| `(\w+)\(", PAGE, re.M))
-    stub = (Path(sw.__file__).with_suffix(".pyi")).read_text("utf-8")
-    assert set(re.findall(r"^from splatwizard_core.steps import (\w+) as \1$", stub, re.M)) == set(sw.__all__)
     program = "import sys, splatwizard_core; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
 

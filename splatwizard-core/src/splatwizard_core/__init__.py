@@ -3,4 +3,4 @@
 from splatwizard_native import lazy_exports
 
 __version__ = "0.3.0"
-__all__, __getattr__ = lazy_exports(__name__, {"steps": "decode encode evaluate load_scene render run train"})
+__all__, __getattr__ = lazy_exports(__name__)

@@ -3,31 +3,24 @@
 from __future__ import annotations
 
 import importlib
+import re
 import sys
 import warnings
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
+LENT = re.compile(r"^from (\S+) import (\w+) as \2$", re.MULTILINE)
 
-def lazy_exports(
-    face: str,
-    modules: Mapping[str, str],
-    base: Mapping[str, str] | None = None,
-    older: Mapping[str, str] | None = None,
-) -> tuple[list[str], Callable[[str], Any]]:
-    """Make `__all__` and `__getattr__` of the module `face`: a package, or a module directly in it.
 
-    modules     module of the package, without its name -> names to re-export, separated by spaces
-    base        the same of modules of this package
-    older       the same of the package, of names that are in no `__all__` and go with the next release
+def lazy_exports(face: str, older: Mapping[str, str] | None = None) -> tuple[list[str], Callable[[str], Any]]:
+    """Make `__all__` and `__getattr__` of the module `face` from its stub: lines `from MODULE import NAME as NAME`.
+
+    older   module -> names, separated by spaces, that are in no `__all__` and go with the next release
     """
-
-    def by_name(package: str, table: Mapping[str, str]) -> dict[str, str]:
-        return {name: f"{package}.{module}" for module, names in table.items() for name in names.split()}
-
-    package = face.partition(".")[0]
-    homes = by_name(package, modules) | by_name(__name__.partition(".")[0], base or {})
-    going = by_name(package, older or {})
+    stub = Path(str(sys.modules[face].__file__)).with_suffix(".pyi")
+    homes = {name: home for home, name in LENT.findall(stub.read_text("utf-8"))} if stub.is_file() else {}
+    going = {name: home for home, names in (older or {}).items() for name in names.split()}
 
     def find(name: str) -> Any:
         """Import a name on first use: a plugin that only registers itself imports no torch."""

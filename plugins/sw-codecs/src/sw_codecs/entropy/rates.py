@@ -17,7 +17,8 @@ from sw_codecs.entropy.fast import gaussian_bits as fast_bits
 
 # Old import paths, until 0.4.
 _, __getattr__ = lazy_exports(
-    __name__, {"entropy.further_rates": "laplace_mass laplace_bits mixture_bits bernoulli_bits categorical_bits"}
+    __name__,
+    {"sw_codecs.entropy.further_rates": "laplace_mass laplace_bits mixture_bits bernoulli_bits categorical_bits"},
 )
 
 CODER_FLOOR = 2.0**-24  # the smallest probability that the range coder has
