@@ -24,89 +24,49 @@ hookspec = pluggy.HookspecMarker(PROJECT)
 hookimpl = pluggy.HookimplMarker(PROJECT)
 
 
-@hookspec
-def register_rasterizers(registry: Registry) -> None:
-    """Add rasterizers: classes or factories () -> Rasterizer, with the fields of RasterizerInfo."""
+REGISTERED = {
+    "rasterizers": "Add rasterizers: classes or factories () -> Rasterizer, with the fields of RasterizerInfo.",
+    "pruners": (
+        "Add pruners: classes whose objects have score(model, cameras, rasterizer, background) -> [N], higher = keep."
+    ),
+    "quantizers": "Add quantizers: forward(x) for training; encode(x) and decode(...) exact on the lattice.",
+    "entropy_models": "Add entropy models: bits(symbols, context), encode(symbols, context), decode(bytes, context).",
+    "context_models": "Add context models: modules that predict entropy-model parameters from what is already decoded.",
+    "coders": "Add coders: of symbols, positions, arrays, or whole Gaussian models, as the field `codes` declares.",
+    "tasks": "Add schedule tasks: callables (or factories of them) whose annotations say what they need.",
+    "density_controls": (
+        "Add density controls: subclasses of splatwizard_core.api.DensityControl, made with their settings."
+    ),
+    "methods": "Add methods: subclasses of splatwizard_core.api.Method, with their presets and rate points.",
+    "datasets": "Add dataset families: objects with detect(path) -> score and load(path, options) -> Scene.",
+    "metrics": (
+        "Add metrics: callables (render [3,H,W], truth [3,H,W]) -> float or factories of them; or `over` models."
+    ),
+    "exporters": "Add exporters: callables (model, path) that write an interchange format, with its file name suffix.",
+    "importers": (
+        "Add importers: callables (path) -> GaussianModel that read an interchange format, with its file name suffix."
+    ),
+    "executors": "Add executors: where the runs of a sweep happen (local processes, a cluster).",
+    "checks": (
+        "Add checks of the machine: callables () -> list[Check], each run in a process of its own when a user asks."
+    ),
+    "downloads": "Add downloads: callables () -> the registry of data sets (TOML bytes) that can be fetched.",
+    "commands": (
+        "Add subcommands of `sw`: click commands, imported when they are called; the summary is their line in the help."
+    ),
+}
+"""Things that plugins provide -> what their hook `register_THINGS(registry)` does."""
 
 
-@hookspec
-def register_pruners(registry: Registry) -> None:
-    """Add pruners: classes whose objects have score(model, cameras, rasterizer, background) -> [N], higher = keep."""
+def _registering(does: str) -> Any:
+    def hook(registry: Registry) -> None: ...
+
+    hook.__doc__ = does
+    return hookspec(hook)
 
 
-@hookspec
-def register_quantizers(registry: Registry) -> None:
-    """Add quantizers: forward(x) for training; encode(x) and decode(...) exact on the lattice."""
-
-
-@hookspec
-def register_entropy_models(registry: Registry) -> None:
-    """Add entropy models: bits(symbols, context), encode(symbols, context), decode(bytes, context)."""
-
-
-@hookspec
-def register_context_models(registry: Registry) -> None:
-    """Add context models: modules that predict entropy-model parameters from what is already decoded."""
-
-
-@hookspec
-def register_coders(registry: Registry) -> None:
-    """Add coders: of symbols, positions, arrays, or whole Gaussian models, as the field `codes` declares."""
-
-
-@hookspec
-def register_tasks(registry: Registry) -> None:
-    """Add schedule tasks: callables (or factories of them) whose annotations say what they need."""
-
-
-@hookspec
-def register_density_controls(registry: Registry) -> None:
-    """Add density controls: subclasses of splatwizard_core.api.DensityControl, made with their settings."""
-
-
-@hookspec
-def register_methods(registry: Registry) -> None:
-    """Add methods: subclasses of splatwizard_core.api.Method, with their presets and rate points."""
-
-
-@hookspec
-def register_datasets(registry: Registry) -> None:
-    """Add dataset families: objects with detect(path) -> score and load(path, options) -> Scene."""
-
-
-@hookspec
-def register_metrics(registry: Registry) -> None:
-    """Add metrics: callables (render [3,H,W], truth [3,H,W]) -> float or factories of them; or `over` models."""
-
-
-@hookspec
-def register_exporters(registry: Registry) -> None:
-    """Add exporters: callables (model, path) that write an interchange format, with its file name suffix."""
-
-
-@hookspec
-def register_importers(registry: Registry) -> None:
-    """Add importers: callables (path) -> GaussianModel that read an interchange format, with its file name suffix."""
-
-
-@hookspec
-def register_executors(registry: Registry) -> None:
-    """Add executors: where the runs of a sweep happen (local processes, a cluster)."""
-
-
-@hookspec
-def register_checks(registry: Registry) -> None:
-    """Add checks of the machine: callables () -> list[Check], each run in a process of its own when a user asks."""
-
-
-@hookspec
-def register_downloads(registry: Registry) -> None:
-    """Add downloads: callables () -> the registry of data sets (TOML bytes) that can be fetched."""
-
-
-@hookspec
-def register_commands(registry: Registry) -> None:
-    """Add subcommands of `sw`: click commands, imported when they are called; the summary is their line in the help."""
+for _things, _does in REGISTERED.items():
+    globals()[f"register_{_things}"] = _registering(_does)
 
 
 @hookspec
