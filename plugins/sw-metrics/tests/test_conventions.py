@@ -10,7 +10,7 @@ from sw_metrics.conventions import WINDOW, psnr_channel_mean, psnr_unrounded, ss
 from sw_metrics.torchvision_import import import_torchvision
 
 from splatwizard_core.errors import CapabilityError, ShapeError
-from splatwizard_core.evaluation.image import SIGMA, prepare_render, psnr, ssim
+from splatwizard_core.evaluation.image import prepare_render, psnr, ssim
 
 
 def image(seed: int, height: int = 40, width: int = 52) -> torch.Tensor:
@@ -47,7 +47,7 @@ def pair(seed: int) -> tuple[torch.Tensor, torch.Tensor]:
 
 def scikit_ssim(skimage, x: torch.Tensor, y: torch.Tensor, **options) -> object:
     return skimage.structural_similarity(
-        x.double().numpy(), y.double().numpy(), data_range=1.0, channel_axis=0, gaussian_weights=True, sigma=SIGMA,
+        x.double().numpy(), y.double().numpy(), data_range=1.0, channel_axis=0, gaussian_weights=True, sigma=1.5,
         use_sample_covariance=False, **options,
     )  # fmt: skip
 

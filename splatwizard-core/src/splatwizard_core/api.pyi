@@ -21,7 +21,6 @@ from splatwizard_core.errors import UserInputError as UserInputError
 from splatwizard_core.evaluation.evaluate import MetricResult as MetricResult
 from splatwizard_core.evaluation.evaluate import Subject as Subject
 from splatwizard_core.evaluation.image import psnr as psnr
-from splatwizard_core.evaluation.image import ssim_map as ssim_map
 from splatwizard_core.evaluation.metrics import MetricSetup as MetricSetup
 from splatwizard_core.evaluation.metrics import PreparedMetric as PreparedMetric
 from splatwizard_core.gaussians.inputs import SH as SH
@@ -77,4 +76,5 @@ from splatwizard_core.training.stage import StageContext as StageContext
 from splatwizard_core.training.state import TrainingState as TrainingState
 from splatwizard_core.training.task_log import TaskLog as TaskLog
 from splatwizard_native.files import replacing as replacing
+from splatwizard_native.fused.photometric import ssim_map as ssim_map
 from splatwizard_native.progress import track as track

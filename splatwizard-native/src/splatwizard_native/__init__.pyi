@@ -31,6 +31,7 @@ from splatwizard_native.fused.in_backward import offer_update as offer_update
 from splatwizard_native.fused.in_backward import offered_update as offered_update
 from splatwizard_native.fused.photometric import Padding as Padding
 from splatwizard_native.fused.photometric import photometric as photometric
+from splatwizard_native.fused.photometric import ssim_map as ssim_map
 from splatwizard_native.lazy_imports import lazy_exports as lazy_exports
 from splatwizard_native.lock import HeldError as HeldError
 from splatwizard_native.lock import file_lock as file_lock

@@ -11,13 +11,9 @@ import math
 
 import torch
 from torch import Tensor
-from torch.nn.functional import conv2d
 
 from splatwizard_core.errors import ShapeError
-
-WINDOW = 11  # pixels
-SIGMA = 1.5  # pixels
-C1, C2 = 0.01**2, 0.03**2  # for a data range of 1
+from splatwizard_native import ssim_map
 
 
 def _check(render: Tensor, truth: Tensor) -> None:
@@ -61,22 +57,3 @@ def ssim(render: Tensor, truth: Tensor) -> float:
     """
     _check(render, truth)
     return float(ssim_map(render.float(), truth.float()).double().mean())
-
-
-def ssim_map(x: Tensor, y: Tensor) -> Tensor:
-    """The structural similarity at each pixel, [C,H,W] -> [C,H,W]; pads with zeros, keeps the dtype."""
-    offsets = torch.arange(WINDOW, dtype=torch.float64) - WINDOW // 2
-    window = torch.exp(-(offsets**2) / (2 * SIGMA**2))
-    window = (window / window.sum()).to(x)  # [11]
-
-    def blur(image: Tensor) -> Tensor:
-        rows = image[:, None]  # [C,1,H,W]
-        rows = conv2d(rows, window.view(1, 1, -1, 1), padding=(WINDOW // 2, 0))
-        return conv2d(rows, window.view(1, 1, 1, -1), padding=(0, WINDOW // 2))[:, 0]
-
-    mean_x, mean_y = blur(x), blur(y)
-    var_x, var_y = blur(x * x) - mean_x**2, blur(y * y) - mean_y**2
-    covariance = blur(x * y) - mean_x * mean_y
-    luminance = (2 * mean_x * mean_y + C1) / (mean_x**2 + mean_y**2 + C1)
-    structure = (2 * covariance + C2) / (var_x + var_y + C2)
-    return luminance * structure

@@ -36,7 +36,7 @@ def photometric(
     if fused is not None:
         return fused(image, target, padding == "valid", 1.0 - lambda_dssim, -lambda_dssim, lambda_dssim)
     l1 = (image - target).abs().mean()
-    similarity = _ssim_torch(image, target, padding)
+    similarity = ssim_map(image, target, padding).mean()
     return (1.0 - lambda_dssim) * l1 + lambda_dssim * (1.0 - similarity), l1.detach(), similarity.detach()
 
 
@@ -67,7 +67,8 @@ class _Photometric(torch.autograd.Function):
         return scaled, None, None, None, None, None
 
 
-def _ssim_torch(x: Tensor, y: Tensor, padding: Padding) -> Tensor:
+def ssim_map(x: Tensor, y: Tensor, padding: Padding = "same") -> Tensor:
+    """Return the structural similarity at each pixel, [..., H, W] -> [planes, H, W], in torch operations."""
     height, width = x.shape[-2:]
     moments = torch.stack([x, y, x * x, y * y, x * y]).reshape(1, -1, height, width)  # [1, 5C, H, W]
     planes = moments.shape[1]
@@ -81,8 +82,7 @@ def _ssim_torch(x: Tensor, y: Tensor, padding: Padding) -> Tensor:
     mx, my, xx, yy, xy = blurred.view(5, -1, *blurred.shape[-2:])
     luminance = (2 * mx * my + C1) / (mx * mx + my * my + C1)
     structure = (2 * (xy - mx * my) + C2) / (xx - mx * mx + yy - my * my + C2)
-    similarity: Tensor = (luminance * structure).mean()
-    return similarity
+    return luminance * structure
 
 
 def _fused(x: Tensor, y: Tensor) -> Callable[..., tuple[Tensor, Tensor, Tensor]] | None:
