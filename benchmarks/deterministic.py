@@ -211,8 +211,8 @@ class Training:
 
     def take_turns(self) -> Iterator[None]:
         """Train `args.turn` steps each time; ends where the training does."""
-        from splatwizard_core.base.rng import Streams
         from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
+        from splatwizard_core.streams import Streams
         from splatwizard_core.training.stage import StageContext
         from splatwizard_core.training.state import TrainingState
         from splatwizard_core.training.trainer import Trainer

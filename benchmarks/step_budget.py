@@ -29,13 +29,13 @@ from sw_gaussians.stage import ThreeDGSStage
 from torch.profiler import ProfilerActivity, profile
 
 from splatwizard_core.base.random_states import seeded
-from splatwizard_core.base.rng import Streams
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins.manager import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.scene.images import keep_pictures
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
+from splatwizard_core.streams import Streams
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.stage import StageContext
 from splatwizard_core.training.state import TrainingState

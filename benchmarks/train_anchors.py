@@ -51,7 +51,6 @@ from sw_anchors.fast import networks, replay, rows, sample_bits
 from torch.profiler import ProfilerActivity, profile, record_function
 
 from splatwizard_core.base.random_states import seeded
-from splatwizard_core.base.rng import Streams
 from splatwizard_core.gaussians.inputs import rgb_to_dc
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins.manager import load_plugins
@@ -62,7 +61,7 @@ from splatwizard_core.runs.pretrained import make_method
 from splatwizard_core.runs.session import Session
 from splatwizard_core.scene.images import decode_all, keep_pictures
 from splatwizard_core.scene.scene import Scene
-from splatwizard_core.streams import stream
+from splatwizard_core.streams import Streams, stream
 from splatwizard_core.training.stage import StageContext
 from splatwizard_core.training.state import TrainingState
 from splatwizard_core.training.trainer import Trainer

@@ -4,10 +4,10 @@ import pytest
 from small_scene import small_scene, ten_gaussians
 from sw_reference.rasterizer import ReferenceRasterizer
 
-from splatwizard_core.base.rng import Streams
 from splatwizard_core.errors import TaskSignatureError
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.plugins.catalogue import is_ours
+from splatwizard_core.streams import Streams
 from splatwizard_core.training.added_tasks import add_tasks
 from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
 from splatwizard_core.training.params import AddedTask, OptimizationParams, PipelineParams

@@ -13,13 +13,12 @@ from sw_gaussians.start import gaussians_from_points
 from sw_gaussians.statistics import accumulate_in_torch, accumulate_statistics
 
 from splatwizard_core.base.random_states import seeded
-from splatwizard_core.base.rng import Streams
 from splatwizard_core.plugins.manager import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.images import keep_pictures
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
-from splatwizard_core.streams import stream
+from splatwizard_core.streams import Streams, stream
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.stage import StageContext
 from splatwizard_core.training.state import TrainingState

@@ -163,8 +163,7 @@ def changed(before, after):
 @pytest.mark.parametrize("official", [False, True])
 def test_each_phase_trains_what_the_table_says(scene, rasterizer, method, official):
     """A run of 400 steps: published step / 100; growth is off, so that rows stay."""
-    from splatwizard_core.base.rng import Streams
-    from splatwizard_core.streams import stream
+    from splatwizard_core.streams import Streams, stream
     from splatwizard_core.training.state import TrainingState
     from splatwizard_core.training.trainer import Trainer
 

@@ -5,7 +5,6 @@ import torch
 from sw_gaussians.finetune.pruning import removal_count
 from sw_gaussians.statistics import collect_statistics
 
-from splatwizard_core.base.rng import Streams
 from splatwizard_core.errors import ConfigError
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins import load_plugins
@@ -13,7 +12,7 @@ from splatwizard_core.rendering.rasterizer import GradBuffer, RenderResult
 from splatwizard_core.runs.config import resolve
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import Protocol, Scene, View
-from splatwizard_core.streams import stream
+from splatwizard_core.streams import Streams, stream
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.scheduler import build_schedulers, format_plan
 from splatwizard_core.training.stage import StageContext

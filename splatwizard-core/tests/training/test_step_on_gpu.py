@@ -6,7 +6,6 @@ import weakref
 import pytest
 import torch
 
-from splatwizard_core.base.rng import Streams
 from splatwizard_core.base.scalars import Verdict, read_scalars
 from splatwizard_core.errors import TaskError, TrainingDiverged
 from splatwizard_core.evaluation.evaluate import render_view
@@ -15,6 +14,7 @@ from splatwizard_core.plugins.manager import load_plugins
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.runs.device import device_reason
 from splatwizard_core.scene.images import keep_pictures
+from splatwizard_core.streams import Streams
 from splatwizard_core.training import trainer as trainer_module
 from splatwizard_core.training.losses import LossPack
 from splatwizard_core.training.optimizer import SplatOptimizer

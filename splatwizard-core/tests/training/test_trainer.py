@@ -8,7 +8,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from splatwizard_core.base.rng import Streams
 from splatwizard_core.errors import (
     ConfigError,
     EmptyModel,
@@ -19,6 +18,7 @@ from splatwizard_core.errors import (
 )
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.rendering.rasterizer import Rasterizer, RenderResult
+from splatwizard_core.streams import Streams
 from splatwizard_core.training import timing
 from splatwizard_core.training.losses import LossPack
 from splatwizard_core.training.optimizer import SplatOptimizer

@@ -12,7 +12,6 @@ from typing import Any
 import torch
 
 from splatwizard_core.base.random_states import seeded
-from splatwizard_core.base.rng import Streams
 from splatwizard_core.base.run_log import RunLog
 from splatwizard_core.errors import CheckpointError, ConfigError
 from splatwizard_core.gaussians.splat_model import SplatModel
@@ -20,6 +19,7 @@ from splatwizard_core.rendering.features import Feature
 from splatwizard_core.rendering.rasterizer import Rasterizer
 from splatwizard_core.scene.images import decode_all, keep_pictures
 from splatwizard_core.scene.scene import Scene
+from splatwizard_core.streams import Streams
 from splatwizard_core.training.checkpoint import (
     Checkpoint,
     CheckpointStore,

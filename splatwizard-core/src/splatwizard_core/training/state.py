@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.base.random_states import capture_random_states, restore_random_states
-from splatwizard_core.base.rng import Streams
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.rendering.rasterizer import Rasterizer
 from splatwizard_core.scene.scene import Scene
+from splatwizard_core.streams import Streams
 from splatwizard_core.training.checkpoint import Checkpoint, normalised
 from splatwizard_core.training.measurements import TrainingFigures
 from splatwizard_core.training.params import PipelineParams
