@@ -5,7 +5,7 @@ A message says what is wrong (with the value), where, and what to do, in one or 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
 from splatwizard_native import ForeseenError
@@ -60,12 +60,8 @@ class BitstreamError(UserInputError):
 class ShapeError(UserInputError):
     """A tensor does not have the shape, dtype or device that a function documents."""
 
-    def __init__(
-        self, message: str, *, actual: Sequence[int] | None = None, expected: Sequence[int | str] | None = None
-    ) -> None:
+    def __init__(self, message: str, **_: object) -> None:  # `actual` and `expected` of 0.2, which nothing read
         super().__init__(message)
-        self.actual = tuple(actual) if actual is not None else None
-        self.expected = tuple(expected) if expected is not None else None
 
 
 class PluginError(UserInputError):

@@ -238,11 +238,7 @@ class AnchorModel(AnchorSplats):
             fits = fits and all(e in (-1, a) for a, e in zip(tensor.shape[1:], tail, strict=True))
             if not fits:
                 expected = (n, *("any" if e == -1 else e for e in tail))
-                raise ShapeError(
-                    f"AnchorModel.{name} must be {list(expected)}, got {list(tensor.shape)}",
-                    actual=tensor.shape,
-                    expected=expected,
-                )
+                raise ShapeError(f"AnchorModel.{name} must be {list(expected)}, got {list(tensor.shape)}")
             self.register_parameter(name, nn.Parameter(tensor.detach()))
         k = offsets.shape[1]
         for name, shape in (

@@ -71,9 +71,7 @@ def _check(u: AdamUpdate, rows: Tensor) -> None:
     for name, tensor, shape in expected:
         if tensor.shape != shape or param.dim() == 0:
             raise ShapeError(
-                f"{name} is {list(tensor.shape)}, the parameter {list(param.shape)}: it must be {list(shape)}",
-                actual=tensor.shape,
-                expected=tuple(shape),
+                f"{name} is {list(tensor.shape)}, the parameter {list(param.shape)}: it must be {list(shape)}"
             )
 
 

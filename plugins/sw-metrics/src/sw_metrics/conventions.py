@@ -20,11 +20,7 @@ WINDOW = 11  # pixels: the width of SSIM's window
 def check_pair(render: Tensor, truth: Tensor) -> None:
     """Raise ShapeError unless both are [3,H,W] of one size."""
     if render.dim() != 3 or render.shape[0] != 3 or render.shape != truth.shape:
-        raise ShapeError(
-            f"image metrics need two [3,H,W] images, got {list(render.shape)} and {list(truth.shape)}",
-            actual=render.shape,
-            expected=(3, "H", "W"),
-        )
+        raise ShapeError(f"image metrics need two [3,H,W] images, got {list(render.shape)} and {list(truth.shape)}")
 
 
 def psnr_unrounded(render: Tensor, truth: Tensor) -> float:

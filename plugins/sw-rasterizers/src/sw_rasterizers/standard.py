@@ -57,7 +57,7 @@ class StandardRasterizer:
             return replace(result, scores=found.scores, fisher=found.fisher)
         call = self._call(g, cam, opt)
         if g.colors is not None and g.colors.shape[1] == 0 and g.features is None and not opt.depth:
-            raise ShapeError("GaussianInputs.colors has no channel: there is nothing to draw", actual=g.colors.shape)
+            raise ShapeError("GaussianInputs.colors has no channel: there is nothing to draw")
         if (opt.absgrad or opt.fragment_grad) and g.means.is_cuda:
             _check_absgrad(g, call.flags)
         sh = g.sh
@@ -128,7 +128,7 @@ class StandardRasterizer:
         self.info.check_request(g, opt)
         check_count(opt.scores)
         if g.colors is not None and g.colors.shape[1] == 0:
-            raise ShapeError("GaussianInputs.colors has no channel: there is nothing to draw", actual=g.colors.shape)
+            raise ShapeError("GaussianInputs.colors has no channel: there is nothing to draw")
         totals = Totals(g, opt)
         plain = replace(opt, depth=frozenset(), alpha=False, absgrad=False, fragment_grad=False, grad2d=False)
         for cam in cams:

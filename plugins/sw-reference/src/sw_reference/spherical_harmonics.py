@@ -49,7 +49,7 @@ def eval_sh(sh: Tensor, directions: Tensor, active_degree: int) -> Tensor:
     Returns [N,3]. Raises ShapeError if K is no square of 1 to 4.
     """
     if sh.dim() != 3 or sh.shape[-1] != 3:
-        raise ShapeError(f"sh must be [N,K,3], got {list(sh.shape)}", actual=sh.shape, expected=("N", "K", 3))
+        raise ShapeError(f"sh must be [N,K,3], got {list(sh.shape)}")
     if sh.shape[1] not in (1, 4, 9, 16):
         raise ShapeError(f"{sh.shape[1]} SH coefficients belong to no degree from 0 to 3; expected 1, 4, 9 or 16")
     degree = min(active_degree, math.isqrt(sh.shape[1]) - 1)

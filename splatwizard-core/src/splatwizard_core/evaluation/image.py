@@ -18,11 +18,7 @@ from splatwizard_native import ssim_map
 
 def _check(render: Tensor, truth: Tensor) -> None:
     if render.dim() != 3 or render.shape[0] != 3 or render.shape != truth.shape:
-        raise ShapeError(
-            f"image metrics need two [3,H,W] images, got {list(render.shape)} and {list(truth.shape)}",
-            actual=render.shape,
-            expected=(3, "H", "W"),
-        )
+        raise ShapeError(f"image metrics need two [3,H,W] images, got {list(render.shape)} and {list(truth.shape)}")
 
 
 def prepare_render(image: Tensor, *, quantize8: bool = True) -> Tensor:

@@ -64,7 +64,7 @@ def check_shape(name: str, shape: torch.Size, expected: tuple[int | str, ...]) -
     """Raise ShapeError unless the tensor's shape is `expected`; a string there stands for any size."""
     if len(shape) != len(expected) or any(a != e for a, e in zip(shape, expected, strict=True) if isinstance(e, int)):
         wanted = ", ".join(str(e) for e in expected)
-        raise ShapeError(f"{name} must be [{wanted}], got {list(shape)}", actual=shape, expected=expected)
+        raise ShapeError(f"{name} must be [{wanted}], got {list(shape)}")
 
 
 _SIZES: dict[str, tuple[int | str, ...]] = {
@@ -182,9 +182,7 @@ def _check_layout(layout: Layout, sh_degree: int | None) -> None:
     elif (scales := shapes["scales"])[1] not in (2, 3) or scales[0] != shapes["quats"][0]:
         raise ShapeError(
             f"GaussianInputs.scales must be [{rows}, 3], or [{rows}, 2] for surfels, and as long as quats; "
-            f"got {list(scales)} and {list(shapes['quats'])}",
-            actual=scales,
-            expected=(rows, "2 or 3"),
+            f"got {list(scales)} and {list(shapes['quats'])}"
         )
     if (sh_degree is None) == ("colors" not in shapes):
         raise ShapeError("GaussianInputs needs either sh or colors")

@@ -96,8 +96,7 @@ class GaussianModel(SplatModel):
         degree = self.max_sh_degree
         if (degree + 1) ** 2 != sh_rest.shape[1] + 1 or degree > 3:
             raise ShapeError(
-                f"GaussianModel.sh_rest has {sh_rest.shape[1]} coefficients per channel; 0, 3, 8 or 15 are possible",
-                actual=sh_rest.shape,
+                f"GaussianModel.sh_rest has {sh_rest.shape[1]} coefficients per channel; 0, 3, 8 or 15 are possible"
             )
         self.active_sh_degree = degree if active_sh_degree is None else active_sh_degree
         if not 0 <= self.active_sh_degree <= degree:

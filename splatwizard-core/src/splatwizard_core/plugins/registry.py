@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import importlib
 import os
 from collections.abc import Callable, Iterator, Mapping
@@ -56,12 +57,10 @@ class Entry:
 
     def load(self) -> Any:
         """Import the target. Raises PluginError that names the distribution."""
-        module_name, _, attribute = self.target.partition(":")
+        module, _, attribute = self.target.partition(":")
         try:
             with prints_to_stderr(), self.held(imports=True):
-                found: Any = importlib.import_module(module_name)
-                for part in attribute.split("."):
-                    found = getattr(found, part)
+                found: Any = functools.reduce(getattr, attribute.split("."), importlib.import_module(module))
         except (Exception, SystemExit) as error:
             why = f"{type(error).__name__}: {error}{migration_hint(self.distribution, error)}"
             raise PluginError(f"{self.whose} could not be loaded from {self.target}: {why}") from error

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-import importlib
+import pkgutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -108,9 +108,7 @@ class RasterizerInfo:
                 return f"it needs compute capability {here.min_cc}, this GPU has {capability}"
         if here.available is None:
             return None
-        module, _, function = here.available.partition(":")
-        probe: Callable[[], str | None] = getattr(importlib.import_module(module), function)
-        return probe()
+        return pkgutil.resolve_name(here.available)()  # type: ignore[no-any-return]
 
     def check_request(self, g: GaussianInputs, opt: RasterOptions) -> None:
         """Hold a request to draw `g` with `opt` against the declaration; every rasterizer calls it first.

@@ -100,9 +100,7 @@ class RasterOptions:
         if self.background.shape not in ((channels,), (channels, cam.height, cam.width)):
             raise ShapeError(
                 f"background must be [{channels}] or [{channels}, {cam.height}, {cam.width}], "
-                f"got {list(self.background.shape)}",
-                actual=self.background.shape,
-                expected=(channels, cam.height, cam.width),
+                f"got {list(self.background.shape)}"
             )
         return self.background.to(like)
 

@@ -40,11 +40,7 @@ class Camera:
 
     def __post_init__(self) -> None:
         if self.R.shape != (3, 3) or self.tau.shape != (3,):
-            raise ShapeError(
-                f"Camera needs R [3,3] and tau [3], got {tuple(self.R.shape)} and {tuple(self.tau.shape)}",
-                actual=self.R.shape,
-                expected=(3, 3),
-            )
+            raise ShapeError(f"Camera needs R [3,3] and tau [3], got {tuple(self.R.shape)} and {tuple(self.tau.shape)}")
 
     @classmethod
     def look_at(

@@ -50,17 +50,12 @@ def _check(x: Tensor, y: Tensor, padding: str) -> None:
     if padding not in ("same", "valid"):
         raise ValueError(f"padding is '{padding}'; it must be 'same' or 'valid'")
     if x.shape != y.shape or x.dim() < 2:
-        raise ShapeError(
-            f"the two images are {list(x.shape)} and {list(y.shape)}; they must be alike, [..., H, W]",
-            actual=y.shape,
-            expected=tuple(x.shape),
-        )
+        raise ShapeError(f"the two images are {list(x.shape)} and {list(y.shape)}; they must be alike, [..., H, W]")
     if x.dtype != y.dtype or x.device != y.device:
         raise ShapeError(f"the two images are {x.dtype} on {x.device} and {y.dtype} on {y.device}; they must be alike")
     least = 1 if padding == "same" else WINDOW
     if min(x.shape[-2:]) < least or x.numel() == 0:
         raise ShapeError(
             f"an image of {x.shape[-1]} x {x.shape[-2]} pixels is too small for SSIM with padding '{padding}'; "
-            f"it takes at least {least} x {least}",
-            actual=x.shape,
+            f"it takes at least {least} x {least}"
         )

@@ -157,11 +157,7 @@ class SplatOptimizer:
         """
         ordered = mask.dtype == torch.int64
         if not ordered and (mask.dtype != torch.bool or mask.shape != (model.num_rows,)):
-            raise ShapeError(
-                f"keep_rows needs a bool mask [{model.num_rows}], got {mask.dtype} {list(mask.shape)}",
-                actual=mask.shape,
-                expected=(model.num_rows,),
-            )
+            raise ShapeError(f"keep_rows needs a bool mask [{model.num_rows}], got {mask.dtype} {list(mask.shape)}")
         index = mask if ordered else mask.nonzero().squeeze(1)
         everything = not ordered and index.numel() == mask.numel()
 
@@ -273,9 +269,7 @@ def _check_rows(model: SplatModel, rows: Mapping[str, Tensor], doing: str, count
         if new.shape[1:] != row or new.dim() == 0 or count not in (None, len(new)):
             expected = ("n" if count is None else count, *row)
             wanted = ", ".join(map(str, expected))
-            raise ShapeError(
-                f"{doing}: '{name}' must be [{wanted}], got {list(new.shape)}", actual=new.shape, expected=expected
-            )
+            raise ShapeError(f"{doing}: '{name}' must be [{wanted}], got {list(new.shape)}")
 
 
 def _parameter(model: SplatModel, name: str) -> nn.Parameter:

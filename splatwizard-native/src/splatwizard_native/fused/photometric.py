@@ -82,7 +82,8 @@ def ssim_map(x: Tensor, y: Tensor, padding: Padding = "same") -> Tensor:
     mx, my, xx, yy, xy = blurred.view(5, -1, *blurred.shape[-2:])
     luminance = (2 * mx * my + C1) / (mx * mx + my * my + C1)
     structure = (2 * (xy - mx * my) + C2) / (xx - mx * mx + yy - my * my + C2)
-    return luminance * structure
+    similarity: Tensor = luminance * structure
+    return similarity
 
 
 def _fused(x: Tensor, y: Tensor) -> Callable[..., tuple[Tensor, Tensor, Tensor]] | None:

@@ -40,7 +40,7 @@ def training_rows(x: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
     Raises ShapeError for no rows, ValueError for values that are not finite and for weights that are none.
     """
     if x.ndim != 2 or len(x) == 0:
-        raise ShapeError("a codebook cannot be fitted to no rows", actual=x.shape, expected=("N", "d"))
+        raise ShapeError("a codebook cannot be fitted to no rows")
     if not bool(torch.isfinite(x).all()):
         raise ValueError("values to quantize must be finite")
     x = x.detach() if x.dtype == torch.float64 else x.detach().to(torch.float32)

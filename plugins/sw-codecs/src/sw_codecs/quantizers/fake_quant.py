@@ -114,7 +114,7 @@ class FakeQuantAffine(nn.Module):
     def _range_of(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Minimum and maximum of each block and channel, [B, C] float32; inf and -inf where there is no row."""
         if self.channels is not None and (x.ndim != 2 or x.shape[1] != self.channels):
-            raise ShapeError(f"values have shape {list(x.shape)}", actual=x.shape, expected=("N", self.channels))
+            raise ShapeError(f"values have shape {list(x.shape)}")
         if self.minimum.device != x.device:
             self.to(x.device)
         rows = _rows(x.detach()).to(self.minimum.dtype)

@@ -125,7 +125,7 @@ class ResidualVectorQuantizer(nn.Module):
     def _search(self, x: Tensor, books: Tensor) -> tuple[Tensor, Tensor]:
         """Symbols [N, S], and the sum of their entries [N, d]."""
         if x.ndim != 2 or x.shape[1] != books.shape[2]:
-            raise ShapeError(f"rows have shape {list(x.shape)}", actual=x.shape, expected=("N", books.shape[2]))
+            raise ShapeError(f"rows have shape {list(x.shape)}")
         residual = x.detach().to(books.dtype)
         found = []
         for book in books:

@@ -118,5 +118,5 @@ class Uniform:
 def _columns(x: Tensor) -> Tensor:
     """[N] as [N, 1], [N, C] as it is."""
     if x.ndim not in (1, 2):
-        raise ShapeError(f"a quantizer takes [N] or [N, C], not {list(x.shape)}", actual=x.shape, expected=("N", "C"))
+        raise ShapeError(f"a quantizer takes [N] or [N, C], not {list(x.shape)}")
     return x if x.ndim == 2 else x[:, None]

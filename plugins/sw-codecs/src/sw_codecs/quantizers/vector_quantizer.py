@@ -116,7 +116,7 @@ class VectorQuantizer:
         if iterations < 0 or batch < 1 or reseed < 0:
             raise ValueError(f"iterations {iterations}, batch {batch}, reseed {reseed}: must be >= 0, >= 1, >= 0")
         if start is not None and start.shape != (self.size, x.shape[1]):
-            raise ShapeError(f"start has shape {list(start.shape)}", actual=start.shape, expected=(self.size, "d"))
+            raise ShapeError(f"start has shape {list(start.shape)}")
         self.codebook, self.counts, self.sums, errors = train_codebook(
             x, weights, size=self.size, rule=rule, iterations=iterations, batch=batch, decay=self.decay, reseed=reseed,
             generator=generator, start=start, project=project, block=self.block, label=label,
@@ -199,5 +199,5 @@ class VectorQuantizer:
     def _rows(self, x: Tensor) -> Tensor:
         width = None if self.codebook is None else self.codebook.shape[1]
         if x.ndim != 2 or (width is not None and x.shape[1] != width):
-            raise ShapeError(f"rows have shape {list(x.shape)}", actual=x.shape, expected=("N", width or "d"))
+            raise ShapeError(f"rows have shape {list(x.shape)}")
         return x.detach() if x.dtype == torch.float64 else x.detach().to(torch.float32)

@@ -82,11 +82,7 @@ class RahtPlan:
 
     def _checked(self, rows: Tensor) -> Tensor:
         if rows.ndim != 2 or len(rows) != self.size:
-            raise ShapeError(
-                f"the transform is over {self.size} voxels, got {list(rows.shape)}",
-                actual=rows.shape,
-                expected=(self.size, "C"),
-            )
+            raise ShapeError(f"the transform is over {self.size} voxels, got {list(rows.shape)}")
         return rows
 
 

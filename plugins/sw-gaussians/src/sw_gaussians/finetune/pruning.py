@@ -139,11 +139,7 @@ def scores_of(
         scores = pruner.score(model, [view.camera for view in cameras], rasterizer, background)
     name = type(pruner).__name__
     if scores.shape != (model.num_rows,):
-        raise ShapeError(
-            f"pruner {name} gave scores {list(scores.shape)} for {model.num_rows} primitives",
-            actual=scores.shape,
-            expected=(model.num_rows,),
-        )
+        raise ShapeError(f"pruner {name} gave scores {list(scores.shape)} for {model.num_rows} primitives")
     if bool(torch.isnan(scores).any()):
         raise ValueError(f"a score of pruner {name} is not a number")
     return scores
