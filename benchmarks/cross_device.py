@@ -26,7 +26,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from splatwizard_native import file_sha256
+from splatwizard_core.base.files import file_sha256
 
 LONGEST = 100  # characters of an error in the table
 COLUMNS = ("run", "written on", "bytes", "encode s", "decode s", "decodings", "the devices' files")

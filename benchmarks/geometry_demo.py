@@ -35,11 +35,12 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from splatwizard_core.base.files import file_sha256
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.plugins.manager import load_plugins
 from splatwizard_core.runs.config import resolve
 from splatwizard_core.runs.pretrained import named_scenes
-from splatwizard_native import available_cores, file_sha256
+from splatwizard_native import available_cores
 
 METHODS = "3dgs@r3+r4+r6,2dgs@r3+r4+r6,trim-3dgs@r3+r4+r6,trim-2dgs@r3+r4+r6,hac@r3"
 LONGEST = 200  # characters of an error

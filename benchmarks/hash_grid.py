@@ -14,7 +14,7 @@ import time
 
 import torch
 
-from splatwizard_native import synchronize
+from splatwizard_core.base.memory import synchronize
 from sw_codecs.context.fast import grid_lookup
 from sw_codecs.context.hash_grid import HashGrid
 

@@ -23,7 +23,7 @@ from pathlib import Path
 import torch
 
 from splatwizard_core.api import SH, GaussianInputs, RasterOptions
-from splatwizard_native import MemoryMeter, synchronize
+from splatwizard_core.base.memory import MemoryMeter, synchronize
 from sw_rasterizers.standard import StandardRasterizer
 from sw_rasterizers.variants import IndexedRasterizer
 

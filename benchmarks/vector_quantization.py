@@ -29,8 +29,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from splatwizard_core.base.memory import peak_rss_bytes
 from splatwizard_core.plugins import load_plugins
-from splatwizard_native import peak_rss_bytes
 
 CONTESTANTS = {"fit": "vq.fit", "train": "vq.train, ema", "sklearn": "MiniBatchKMeans"}
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from splatwizard_native.files import _numbering
+from splatwizard_core.base.files import _numbering
 
 
 @contextlib.contextmanager

@@ -14,11 +14,11 @@ import zstandard
 from bitstream_page import container as page_container
 from bitstream_page import entropy_coders, entropy_models, method_files, positions
 
+from splatwizard_core.base import strict_json
 from splatwizard_core.cli.main import main
 from splatwizard_core.coding import container, limits
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.runs.decode import open_model
-from splatwizard_native import strict_json
 from sw_codecs.entropy import column_plan
 from sw_codecs.positions import point_limit
 

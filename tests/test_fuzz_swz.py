@@ -20,11 +20,11 @@ from sw_kit import hostile_files
 from sw_kit.hostile_files import Mutator, Parts, Tally, attempt
 from swz_fuzzer import blind, open_handles
 
+from splatwizard_core.base.memory import reset_peak_rss
 from splatwizard_core.coding.container import ContainerReader, decoded_limit
 from splatwizard_core.errors import BitstreamError, PluginError
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.runs.decode import open_model
-from splatwizard_native import reset_peak_rss
 from sw_codecs.entropy.exact_tables import exact_tables
 
 TESTS = Path(__file__).parent

@@ -119,7 +119,7 @@ def test_the_longest_chain_of_imports_stays_short():
 def test_the_base_imports_nothing_of_ours():
     ours = {m for p in files_of(NATIVE) for m in imported(p) if m.startswith(("splatwizard_", "sw_"))}
     assert {name.partition(".")[0] for name in ours} == {"splatwizard_native"}
-    assert declared_dependencies(NATIVE) == {"torch", "numpy", "filelock", "psutil", "rich"}
+    assert declared_dependencies(NATIVE) == {"torch", "numpy", "filelock"}
 
 
 # What a reader must follow

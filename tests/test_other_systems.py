@@ -63,7 +63,7 @@ sys.exit(main(["list-plugins"]))
 def test_the_peak_of_memory_is_asked_for_as_windows_tells_it(monkeypatch: pytest.MonkeyPatch):
     from types import SimpleNamespace
 
-    from splatwizard_native import memory
+    from splatwizard_core.base import memory
 
     told = SimpleNamespace(memory_info=lambda: SimpleNamespace(peak_wset=123, rss=7))
     monkeypatch.setattr(memory, "_STATUS", Path("nowhere"))

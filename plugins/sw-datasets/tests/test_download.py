@@ -272,7 +272,7 @@ def test_a_disk_that_fills_meanwhile_keeps_what_came(site: Site, target: Path, m
 def test_progress_and_time_left_are_shown(
     site: Site, target: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr("splatwizard_native.progress.Bar._interval", 0.0)
+    monkeypatch.setattr("splatwizard_core.base.progress.Bar._interval", 0.0)
     monkeypatch.setattr(module, "CHUNK_BYTES", 100_000)
     download(site.url(PATH), target)
     shown = capsys.readouterr().err

@@ -19,7 +19,7 @@ from sw_datasets.downloads import unpack as module
 from sw_datasets.downloads.unpack import unpack_scenes, unpack_whole
 from sw_datasets.errors import FetchError
 
-from splatwizard_native import DiskFullError
+from splatwizard_core.errors import DiskFullError
 
 SCENES = {
     "360/garden/images/a b.jpg": b"a",

@@ -9,7 +9,7 @@ import torch
 from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_scene, front_camera, with_tensors
 
 from splatwizard_core.api import Camera, GaussianInputs, RasterOptions, ScoreSpec
-from splatwizard_native import MemoryMeter
+from splatwizard_core.base.memory import MemoryMeter
 from sw_rasterizers.inference import FlashRasterizer
 from sw_rasterizers.native import MODULE, unavailable_on_cuda
 from sw_rasterizers.standard import StandardRasterizer

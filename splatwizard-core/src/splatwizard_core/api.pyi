@@ -1,3 +1,5 @@
+from splatwizard_core.base.files import replacing as replacing
+from splatwizard_core.base.progress import track as track
 from splatwizard_core.coding.container import ContainerReader as ContainerReader
 from splatwizard_core.coding.container import ContainerWriter as ContainerWriter
 from splatwizard_core.coding.contracts import ArrayCoder as ArrayCoder
@@ -75,6 +77,4 @@ from splatwizard_core.training.stage import Stage as Stage
 from splatwizard_core.training.stage import StageContext as StageContext
 from splatwizard_core.training.state import TrainingState as TrainingState
 from splatwizard_core.training.task_log import TaskLog as TaskLog
-from splatwizard_native.files import replacing as replacing
 from splatwizard_native.fused.photometric import ssim_map as ssim_map
-from splatwizard_native.progress import track as track

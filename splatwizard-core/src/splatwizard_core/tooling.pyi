@@ -1,5 +1,17 @@
 from splatwizard_core.base.block import Shown as Shown
+from splatwizard_core.base.files import bytes_with_named as bytes_with_named
+from splatwizard_core.base.files import file_sha256 as file_sha256
+from splatwizard_core.base.files import new_folder as new_folder
+from splatwizard_core.base.files import remove_folder as remove_folder
+from splatwizard_core.base.files import write_atomic as write_atomic
+from splatwizard_core.base.files import write_json as write_json
 from splatwizard_core.base.lock import directory_lock as directory_lock
+from splatwizard_core.base.memory import peak_rss_bytes as peak_rss_bytes
+from splatwizard_core.base.memory import reset_peak_rss as reset_peak_rss
+from splatwizard_core.base.memory import rss_bytes as rss_bytes
+from splatwizard_core.base.progress import Bar as Bar
+from splatwizard_core.base.progress import duration as duration
+from splatwizard_core.base.strict_json import json_reason as json_reason
 from splatwizard_core.base.toml_file import read_toml as read_toml
 from splatwizard_core.cli.complete import COMPLETION_VARIABLE as COMPLETION_VARIABLE
 from splatwizard_core.cli.complete import SCENE as SCENE
@@ -32,6 +44,7 @@ from splatwizard_core.cli.setup import Choices as Choices
 from splatwizard_core.cli.setup import open_session as open_session
 from splatwizard_core.cli.setup import takes_choices as takes_choices
 from splatwizard_core.coding.limits import decoded_limit as decoded_limit
+from splatwizard_core.errors import DiskFullError as DiskFullError
 from splatwizard_core.errors import RunLockedError as RunLockedError
 from splatwizard_core.evaluation.evaluate import png_names as png_names
 from splatwizard_core.evaluation.evaluate import render_options as render_options
@@ -86,9 +99,3 @@ from splatwizard_core.training.pipeline import TrainingStopped as TrainingStoppe
 from splatwizard_core.training.scheduler import build_schedulers as build_schedulers
 from splatwizard_core.training.state import TrainingState as TrainingState
 from splatwizard_native.errors import ForeseenError as ForeseenError
-from splatwizard_native.files import bytes_with_named as bytes_with_named
-from splatwizard_native.files import file_sha256 as file_sha256
-from splatwizard_native.files import new_folder as new_folder
-from splatwizard_native.files import write_atomic as write_atomic
-from splatwizard_native.files import write_json as write_json
-from splatwizard_native.progress import Bar as Bar

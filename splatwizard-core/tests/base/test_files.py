@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from splatwizard_native import DiskFullError, files
-from splatwizard_native.files import (
+from splatwizard_core.base import files
+from splatwizard_core.base.files import (
     bytes_with_named,
     file_sha256,
     remove_folder,
@@ -23,6 +23,7 @@ from splatwizard_native.files import (
     write_atomic,
     write_json,
 )
+from splatwizard_core.errors import DiskFullError
 
 
 def interrupted_write(path: Path) -> None:
@@ -78,7 +79,7 @@ def test_what_a_killed_process_left_goes_with_the_next_write(tmp_path: Path):
     """Only of that file, and not what a running process is writing."""
     path = tmp_path / "x"
     program = (
-        "import os, signal, sys\nfrom splatwizard_native.files import replacing\n"
+        "import os, signal, sys\nfrom splatwizard_core.base.files import replacing\n"
         "with replacing(sys.argv[1]) as t:\n    t.write_text('half')\n    os.kill(os.getpid(), signal.SIGKILL)\n"
     )
     subprocess.run([sys.executable, "-c", program, str(path)], check=False, timeout=300)
@@ -120,7 +121,7 @@ def test_a_scratch_folder_goes_and_takes_those_of_killed_processes_along(
 ):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     program = (
-        "import os, signal, sys, tempfile\nfrom splatwizard_native.files import scratch_folder\n"
+        "import os, signal, sys, tempfile\nfrom splatwizard_core.base.files import scratch_folder\n"
         "tempfile.tempdir = sys.argv[1]\n"
         "with scratch_folder('test') as f:\n    (f / 'x').touch()\n    os.kill(os.getpid(), signal.SIGKILL)\n"
     )

@@ -5,7 +5,8 @@ import pytest
 import torch
 from fresh_memory import fresh_memory
 
-from splatwizard_native import MemoryMeter, memory, reset_peak_rss
+from splatwizard_core.base import memory
+from splatwizard_core.base.memory import MemoryMeter, reset_peak_rss
 
 MEGABYTE = 1 << 20
 

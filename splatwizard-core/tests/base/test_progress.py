@@ -6,8 +6,8 @@ from types import FrameType
 
 import pytest
 
-from splatwizard_native import progress
-from splatwizard_native.progress import duration, track
+from splatwizard_core.base import progress
+from splatwizard_core.base.progress import duration, track
 
 
 @pytest.fixture

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 
 from splatwizard_core.base.interrupt import InterruptGuard
+from splatwizard_core.base.progress import track
 from splatwizard_core.cli.main import main
 from splatwizard_core.cli.streams import ended_like_ctrl_c
 from splatwizard_core.coding.container import ContainerWriter
-from splatwizard_native import track
 
 SW = f"{shlex.quote(sys.executable)} -m splatwizard_core"
 

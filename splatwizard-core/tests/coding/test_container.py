@@ -16,8 +16,14 @@ from splatwizard_core.coding import container
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.coding.limits import EXPANSION_VARIABLE, decoded_limit
 from splatwizard_core.coding.requirements import Requirement
-from splatwizard_core.errors import BitstreamError, ConfigError, PluginError, SceneError, SplatwizardError
-from splatwizard_native import DiskFullError
+from splatwizard_core.errors import (
+    BitstreamError,
+    ConfigError,
+    DiskFullError,
+    PluginError,
+    SceneError,
+    SplatwizardError,
+)
 
 DTYPES = ["bool", "u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f2", "f4", "f8"]
 

@@ -15,8 +15,10 @@ import torch
 from sw_gaussians.ply import export_ply
 from sw_gaussians.start import gaussians_from_points
 
+from splatwizard_core.base.files import TEMPORARY
 from splatwizard_core.base.run_log import RunLog
 from splatwizard_core.cli.main import main
+from splatwizard_core.errors import DiskFullError
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.runs import run as run_module
 from splatwizard_core.runs.config import parse_set, resolve
@@ -26,8 +28,6 @@ from splatwizard_core.runs.facts import DecodingFacts
 from splatwizard_core.runs.run import run, train_only
 from splatwizard_core.runs.session import Session
 from splatwizard_core.scene.scene import PointCloud
-from splatwizard_native import DiskFullError
-from splatwizard_native.files import TEMPORARY
 
 pytestmark = pytest.mark.pipeline
 

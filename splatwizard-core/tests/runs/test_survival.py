@@ -18,9 +18,9 @@ from typing import Any
 import pytest
 from forked_children import run_python, start_python
 
+from splatwizard_core.base.files import TEMPORARY
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.training.checkpoint import CheckpointStore
-from splatwizard_native.files import TEMPORARY
 
 pytestmark = pytest.mark.pipeline
 

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from splatwizard_core.errors import CheckpointError
+from splatwizard_core.errors import CheckpointError, DiskFullError
 from splatwizard_core.training.checkpoint import (
     Checkpoint,
     CheckpointStore,
@@ -20,7 +20,6 @@ from splatwizard_core.training.checkpoint import (
     read_checkpoint,
     split_tensors,
 )
-from splatwizard_native import DiskFullError
 
 
 def make(step=100, stage=0, *, finished=False, **changes):

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from splatwizard_core.base.scalars import Verdict, read_scalars
-from splatwizard_core.errors import TaskError, TrainingDiverged
+from splatwizard_core.errors import DeviceMemoryError, TaskError, TrainingDiverged
 from splatwizard_core.evaluation.evaluate import render_view
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins.manager import load_plugins
@@ -21,7 +21,6 @@ from splatwizard_core.training.optimizer import SplatOptimizer
 from splatwizard_core.training.params import OptimizationParams, PipelineParams
 from splatwizard_core.training.state import TrainingState
 from splatwizard_core.training.trainer import CHECK_EVERY, Trainer
-from splatwizard_native import DeviceMemoryError
 
 TWO_GIB = 2 << 30
 TORCH_SAYS = "CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has a total capacity of 8.00 GiB of which"

@@ -3,9 +3,9 @@
 import pytest
 from fresh_memory import fresh_memory
 
+from splatwizard_core.base.memory import reset_peak_rss
 from splatwizard_core.training.checkpoint import CheckpointStore
 from splatwizard_core.training.params import PipelineParams
-from splatwizard_native import reset_peak_rss
 
 MEGABYTE = 1 << 20
 PART = 200 * MEGABYTE  # far above what the toy training takes

@@ -1,4 +1,4 @@
-"""C++ and CUDA modules for torch, the fused loss and Adam, cores and memory of a process, progress on the terminal.
+"""C++ and CUDA modules for torch, the fused loss and Adam, and the cores of a process.
 
 Importing this imports no torch. `__init__.pyi` lists what is offered here; each name is imported on first use.
 """

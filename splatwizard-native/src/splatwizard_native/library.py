@@ -14,9 +14,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from splatwizard_native.errors import DiskFullError
 from splatwizard_native.face import ABI
-from splatwizard_native.files import write_atomic
 from splatwizard_native.waiting import watch_cores
 
 log = logging.getLogger(__name__)
@@ -44,9 +42,11 @@ def fetch(kept: Path, output: Path) -> bool:
 
 def keep(output: Path, kept: Path) -> None:
     """Keep an object for later builds, if there is space, and forget those of the folder that none used for a while."""
-    with contextlib.suppress(OSError, DiskFullError):
+    with contextlib.suppress(OSError):
         kept.parent.mkdir(exist_ok=True)
-        write_atomic(kept, output.read_bytes())
+        beside = kept.with_name(f".{kept.name}.{os.getpid()}")
+        shutil.copyfile(output, beside)
+        os.replace(beside, kept)
         for other in kept.parent.iterdir():
             if other.stat().st_mtime < time.time() - KEPT_SECONDS:
                 other.unlink()

@@ -9,8 +9,7 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splatwizard_core.tooling import say
-from splatwizard_native import duration
+from splatwizard_core.tooling import duration, say
 from sw_bench.cells import Cell, Job
 from sw_bench.estimates import Estimates
 

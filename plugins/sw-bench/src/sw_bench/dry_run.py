@@ -5,8 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping, Sequence
 
-from splatwizard_core.tooling import print_json, print_table, say
-from splatwizard_native import duration
+from splatwizard_core.tooling import duration, print_json, print_table, say
 from sw_bench.cells import Cell, Job, Layout
 from sw_bench.display import SLOTS_UNKNOWN
 from sw_bench.estimates import Estimates

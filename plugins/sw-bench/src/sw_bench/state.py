@@ -19,8 +19,8 @@ from splatwizard_core.tooling import (
     load_plugins,
     read_record,
     recorded_hash,
+    remove_folder,
 )
-from splatwizard_native import remove_folder
 from sw_bench.cells import TRAINED, Cell, Job, SharedTraining, training_key
 
 CONFIG = "config.toml"

@@ -368,8 +368,8 @@ def test_wrong_use_is_refused():
 
 
 def test_a_long_training_shows_how_long_it_takes(capsys, monkeypatch):
-    monkeypatch.setattr("splatwizard_native.progress.LINE_SECONDS", 0.0)
-    monkeypatch.setattr("splatwizard_native.progress.Bar._interval", 0.0)
+    monkeypatch.setattr("splatwizard_core.base.progress.LINE_SECONDS", 0.0)
+    monkeypatch.setattr("splatwizard_core.base.progress.Bar._interval", 0.0)
     vq = VectorQuantizer(4)
     vq.train(clusters(100, 4), None, 5, 50, generator=gen(), label="colors")
     vq.fit(clusters(100, 4), generator=gen(), iterations=3, label="shapes")

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatwizard_core.api import SceneError, View
-from splatwizard_native import json_reason
+from splatwizard_core.tooling import json_reason
 from sw_datasets.picture_names import name_key
 
 LARGEST = 16 << 20  # bytes of a list

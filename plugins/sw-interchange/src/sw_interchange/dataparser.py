@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from splatwizard_core.api import BitstreamError, SceneError, UserInputError
-from splatwizard_native import json_reason
 from sw_interchange.frames import transformed
 from sw_interchange.scene import GaussianScene
+from sw_interchange.source import json_reason
 
 MAX_BYTES = 1 << 20
 

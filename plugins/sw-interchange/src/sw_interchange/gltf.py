@@ -15,12 +15,11 @@ import numpy as np
 import numpy.typing as npt
 
 from splatwizard_core.api import BitstreamError, UserInputError
-from splatwizard_native import json_reason
 from sw_interchange.bands import COEFFICIENTS, Array
 from sw_interchange.frames import transformed
 from sw_interchange.gltf_writer import EXTENSION
 from sw_interchange.scene import FLAT, LARGEST_LOGIT, GaussianScene, Limits, ReadReport, decoded_bytes
-from sw_interchange.source import Source
+from sw_interchange.source import Source, json_reason
 
 MAX_JSON = 1 << 24
 MAX_NODES = 1 << 16

@@ -17,13 +17,12 @@ import numpy as np
 import numpy.typing as npt
 
 from splatwizard_core.api import BitstreamError
-from splatwizard_native import json_reason
 from sw_interchange.archive import read_archive
 from sw_interchange.bands import Array
 from sw_interchange.known_formats import MAX_META
 from sw_interchange.quats import ROOT_2, from_smallest_three
 from sw_interchange.scene import LARGEST_LOGIT, GaussianScene, Limits, ReadReport, decoded_bytes, logit_of_byte
-from sw_interchange.source import Source
+from sw_interchange.source import Source, json_reason
 from sw_interchange.webp import LARGEST_SIDE, Pixels, decode_image, image_size
 
 MAX_PALETTE = 1 << 16

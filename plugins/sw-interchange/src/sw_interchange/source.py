@@ -33,3 +33,8 @@ class Source:
     def head(self, count: int) -> bytes:
         """The first bytes, at most `count`."""
         return bytes(self.data[:count])
+
+
+def json_reason(error: Exception) -> str:
+    """Say why text is no JSON, after what `json.loads` raised."""
+    return "its brackets are nested too deeply" if isinstance(error, RecursionError) else str(error)

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from splatwizard_core.api import BitstreamError, PluginError
-from splatwizard_native import peak_rss_bytes, reset_peak_rss, rss_bytes
+from splatwizard_core.tooling import peak_rss_bytes, reset_peak_rss, rss_bytes
 
 INTEGERS = (
     0, 1, 2, 3, 7, 127, 128, 255, 256, 4095, 4096, 65_535, 65_536, 2**20, 2**24, 2**31 - 1, 2**31, 2**32 - 1, 2**60,

@@ -15,8 +15,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from splatwizard_core.api import UserInputError
-from splatwizard_core.tooling import SCHEMA, Record, Shown
-from splatwizard_native import json_reason
+from splatwizard_core.tooling import SCHEMA, Record, Shown, json_reason
 from sw_report import numbers
 from sw_report.declared import metric_style, uncompressed
 

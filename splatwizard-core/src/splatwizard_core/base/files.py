@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from splatwizard_native.errors import FULL, DiskFullError
+from splatwizard_core.errors import FULL, DiskFullError
 
 TEMPORARY = r"\.(\d+)-(?:([0-9a-f]{8})-)?[0-9a-f]{8}\.tmp"
 """The end of a temporary file's name, after `.NAME`: the process that writes it, where its number holds (`_numbering`;

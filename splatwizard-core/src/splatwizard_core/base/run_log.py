@@ -12,7 +12,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from splatwizard_native import naming_full_disk, write_atomic
+from splatwizard_core.base.files import naming_full_disk, write_atomic
 
 
 class RunLog:

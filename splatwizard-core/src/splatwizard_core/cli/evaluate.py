@@ -9,13 +9,13 @@ from typing import Any
 
 import click
 
+from splatwizard_core.base.files import scratch_folder
 from splatwizard_core.cli import options as shared
 from splatwizard_core.cli.complete import name_of
 from splatwizard_core.cli.paths import EXISTING, OUTPUT_FOLDER
 from splatwizard_core.cli.setup import Choices, open_session, takes_choices, warn_of_metrics
 from splatwizard_core.errors import SplatwizardError
 from splatwizard_core.plugins import load_plugins
-from splatwizard_native import scratch_folder
 
 
 @click.command("eval", short_help="quality, speed and memory of an encoded scene")

@@ -31,10 +31,10 @@ from splatwizard_core.plugins import load_plugins
 @takes_choices
 def export(file: Path, out: Path, exporter: str | None, world: bool, as_json: bool, chosen: Choices) -> None:
     """Decode FILE (.swz, .ply or another format) and write it to OUT in the format of its suffix, such as .ply."""
+    from splatwizard_core.base.files import bytes_with_named
     from splatwizard_core.gaussians.placement import in_world
     from splatwizard_core.runs.decode import export_model
     from splatwizard_core.runs.measure import opener
-    from splatwizard_native import bytes_with_named
 
     plugins = load_plugins()
     session = open_session(chosen.resolve_without_method(), plugins)

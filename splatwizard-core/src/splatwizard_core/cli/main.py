@@ -16,13 +16,13 @@ from click.shell_completion import CompletionItem
 
 from splatwizard_core.cli.complete import COMPLETION_VARIABLE, completing_command
 from splatwizard_core.cli.streams import abandon_streams, ended_like_ctrl_c, open_streams, without_orders
-from splatwizard_core.errors import PluginError, TaskError
+from splatwizard_core.errors import FULL, DiskFullError, PluginError, TaskError
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.plugins.catalogue import package_of
 from splatwizard_core.plugins.origins import Origins
 from splatwizard_core.plugins.remedies import as_installed
 from splatwizard_core.plugins.strangers_code import exits_are_raised
-from splatwizard_native import FULL, DiskFullError, ForeseenError, shortened
+from splatwizard_native import ForeseenError, shortened
 
 if TYPE_CHECKING:
     from splatwizard_core.plugins import Entry

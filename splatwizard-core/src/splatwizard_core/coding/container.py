@@ -30,11 +30,12 @@ from typing import Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
+from splatwizard_core.base.files import write_atomic
+from splatwizard_core.base.strict_json import dump_strict, load_strict
 from splatwizard_core.coding.array_section import pack_array, unpack_array
 from splatwizard_core.coding.limits import beyond_limit, decoded_limit
 from splatwizard_core.coding.requirements import Requirement, dump_requirements, parse_requirements
 from splatwizard_core.errors import BitstreamError, PluginError, SplatwizardError, no_file
-from splatwizard_native import dump_strict, load_strict, write_atomic
 
 MAGIC = b"SPWZ"
 VERSION = 1

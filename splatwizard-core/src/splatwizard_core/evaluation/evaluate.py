@@ -16,7 +16,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import BitstreamError, SceneError
+from splatwizard_core.base.files import replacing
+from splatwizard_core.base.progress import track
+from splatwizard_core.errors import BitstreamError, SceneError, out_of_memory
 from splatwizard_core.evaluation.image import prepare_render
 from splatwizard_core.evaluation.metrics import (
     MetricInfo,
@@ -34,7 +36,6 @@ from splatwizard_core.plugins.registry import Entry
 from splatwizard_core.rendering.rasterizer import Rasterizer, RasterOptions, RenderResult
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import Scene, View
-from splatwizard_native import out_of_memory, replacing, track
 
 # What a file may ask of a rasterizer, and the type of the value; whatever else its `raster` holds is for the method.
 RASTER_KEYS: Mapping[str, type] = {"profile": str, "antialias": bool, "eps2d": float, "clamp_color": bool}

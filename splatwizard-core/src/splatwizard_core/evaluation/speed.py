@@ -20,7 +20,9 @@ from pydantic import Field
 from torch import Tensor
 
 from splatwizard_core.base.block import Block, MemoryKind, WhyNull
-from splatwizard_native import MemoryMeter, synchronize, track, work_time
+from splatwizard_core.base.memory import MemoryMeter, synchronize
+from splatwizard_core.base.progress import track
+from splatwizard_native import work_time
 
 WARMUP_FRAMES = 10
 CUDA_FRAMES = 100

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard
 
+from splatwizard_core.base.files import file_sha256
 from splatwizard_core.base.toml_file import read_toml
 from splatwizard_core.base.warned import warn_once
 from splatwizard_core.errors import ConfigError, PluginError
@@ -24,7 +25,6 @@ from splatwizard_core.training.identity import DEFAULTS, all_values, given_value
 from splatwizard_core.training.keys import block_keys, dotted, field_at, flatten, input_files, set_at, value_at
 from splatwizard_core.training.overrides import apply_overrides, unknown_key
 from splatwizard_core.training.params import OptimizationParams, Params, PipelineParams, SceneParams
-from splatwizard_native import file_sha256
 
 if TYPE_CHECKING:
     from splatwizard_core.method import Method

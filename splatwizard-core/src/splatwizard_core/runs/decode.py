@@ -8,6 +8,9 @@ from pathlib import Path
 
 import torch
 
+from splatwizard_core.base.files import replacing
+from splatwizard_core.base.memory import MemoryMeter, synchronize
+from splatwizard_core.base.progress import track
 from splatwizard_core.coding.container import ContainerReader
 from splatwizard_core.errors import BitstreamError, PluginError, SplatwizardError, UserInputError
 from splatwizard_core.evaluation.speed import spread
@@ -20,7 +23,7 @@ from splatwizard_core.plugins import PluginManager
 from splatwizard_core.runs.facts import DecodingFacts, contention
 from splatwizard_core.runs.file_needs import missing_plugin, other_versions, upgrade_command
 from splatwizard_core.runs.session import Session
-from splatwizard_native import CoreTime, MemoryMeter, loading_time, replacing, synchronize, track, work_time
+from splatwizard_native import CoreTime, loading_time, work_time
 
 REPEATS = 3
 

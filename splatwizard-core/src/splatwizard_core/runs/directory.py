@@ -13,13 +13,13 @@ from typing import Any, TypeVar
 from pydantic import ValidationError
 
 from splatwizard_core.base.block import Block
+from splatwizard_core.base.files import remove_folder, sweep, write_atomic, write_json
 from splatwizard_core.base.lock import directory_lock
 from splatwizard_core.errors import SceneError
 from splatwizard_core.runs.config import ResolvedConfig
 from splatwizard_core.runs.record import FILE_NAME
 from splatwizard_core.runs.session import Session
 from splatwizard_core.scene.images import check_pictures, decode_all
-from splatwizard_native import remove_folder, sweep, write_atomic, write_json
 
 FactsT = TypeVar("FactsT", bound=Block)
 

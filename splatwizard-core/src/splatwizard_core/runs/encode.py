@@ -10,7 +10,9 @@ from typing import Any
 
 import torch
 
+from splatwizard_core.base.files import file_sha256
 from splatwizard_core.base.lock import directory_lock
+from splatwizard_core.base.memory import synchronize
 from splatwizard_core.base.random_states import one_order_of_sums
 from splatwizard_core.coding.container import ContainerWriter
 from splatwizard_core.coding.requirements import Requirement
@@ -31,7 +33,7 @@ from splatwizard_core.runs.phases import part_of, unique
 from splatwizard_core.runs.pretrained import make_method
 from splatwizard_core.runs.session import Session, TrainedModel
 from splatwizard_core.runs.training import finished_directory, train
-from splatwizard_native import CoreTime, file_sha256, synchronize, work_time
+from splatwizard_native import CoreTime, work_time
 
 NEEDED_KINDS = ("method", "quantizer", "entropy model", "context model", "coder")
 """Kinds that a decoder may want again; a pruner or a rasterizer has done its work by then."""

@@ -11,9 +11,9 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
+from splatwizard_core.base.files import scratch_folder
 from splatwizard_core.errors import SplatwizardError, UserInputError
 from splatwizard_core.runs.facts import DecodingFacts
-from splatwizard_native import scratch_folder
 
 HIDDEN = ("SPLATWIZARD_DATA", "SPLATWIZARD_TEST_DATA")
 

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import torch
 
 from splatwizard_core.base.machine import describe_machine
+from splatwizard_core.base.memory import MemoryMeter, synchronize
 from splatwizard_core.evaluation import evaluate as quality
 from splatwizard_core.evaluation.metrics import MetricSetup, chosen_metrics
 from splatwizard_core.evaluation.speed import SpeedBlock, SpeedReport, measure_speed
@@ -26,7 +27,7 @@ from splatwizard_core.runs.session import Session
 from splatwizard_core.runs.training_views import training_psnr
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import Scene
-from splatwizard_native import CoreTime, MemoryMeter, loading_time, synchronize, work_time
+from splatwizard_native import CoreTime, loading_time, work_time
 
 FEWEST_SPEED_VIEWS = 8
 

@@ -16,10 +16,11 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field, ValidationError
 
 from splatwizard_core.base.block import Block, MemoryKind, Shown, WhyNull
+from splatwizard_core.base.files import write_atomic
+from splatwizard_core.base.strict_json import load_strict
 from splatwizard_core.errors import SplatwizardError, UserInputError
 from splatwizard_core.evaluation.speed import SpeedBlock, SpreadBlock
 from splatwizard_core.training.measurements import LoopFigures, Provided, StagePlan
-from splatwizard_native import load_strict, write_atomic
 
 SCHEMA = 3
 FILE_NAME = "metrics.json"

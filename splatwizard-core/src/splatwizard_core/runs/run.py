@@ -10,6 +10,7 @@ import contextlib
 from datetime import datetime, timezone
 from pathlib import Path
 
+from splatwizard_core.base.files import file_sha256
 from splatwizard_core.base.warned import WARNED
 from splatwizard_core.errors import SplatwizardError, UserInputError
 from splatwizard_core.evaluation.metrics import MetricSetup, chosen_metrics, metric_identities
@@ -35,7 +36,6 @@ from splatwizard_core.runs.pretrained import make_method
 from splatwizard_core.runs.session import Session, TrainedModel
 from splatwizard_core.runs.training import train
 from splatwizard_core.runs.training_views import collapse_warning
-from splatwizard_native import file_sha256
 
 MEASURING = 2  # raised when `sw decode` and `sw eval` come to report more: a step that reported less is done again
 

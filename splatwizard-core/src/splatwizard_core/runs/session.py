@@ -9,6 +9,7 @@ from typing import Any, Literal, TypeVar
 
 import torch
 
+from splatwizard_core.base.files import file_sha256
 from splatwizard_core.errors import SceneError
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.plugins import PluginManager
@@ -19,7 +20,6 @@ from splatwizard_core.runs.facts import TrainingFacts
 from splatwizard_core.scene.digest import scene_digest
 from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.scene.scene import Scene
-from splatwizard_native import file_sha256
 
 T = TypeVar("T")
 Role = Literal["trained", "start"]

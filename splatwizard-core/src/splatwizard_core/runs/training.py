@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from splatwizard_core.base.block import Block
+from splatwizard_core.base.files import sweep, write_atomic
 from splatwizard_core.base.lock import directory_lock, is_held
 from splatwizard_core.errors import SplatwizardError
 from splatwizard_core.evaluation.evaluate import evaluate, kept_header, raster_header
@@ -30,7 +31,7 @@ from splatwizard_core.streams import stream
 from splatwizard_core.training.checkpoint import CheckpointStore
 from splatwizard_core.training.measurements import LoopFigures
 from splatwizard_core.training.pipeline import TrainingRun
-from splatwizard_native import CoreTime, sweep, write_atomic
+from splatwizard_native import CoreTime
 
 STEP = "train"
 BEGUN = "begun"

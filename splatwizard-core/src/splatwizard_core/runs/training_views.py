@@ -13,13 +13,13 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from splatwizard_core.base.progress import track
 from splatwizard_core.evaluation.evaluate import INFINITE, NOT_A_NUMBER
 from splatwizard_core.evaluation.image import prepare_render, psnr
 from splatwizard_core.runs.record import Record, TrainingPsnrBlock
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.images import decoded_ahead
 from splatwizard_core.scene.scene import Scene
-from splatwizard_native import track
 
 FAR_BELOW = 8.0  # dB from the median of the training views down to one that is warned of
 LARGEST_GAP = 3.0  # dB between the means of training and of test views

@@ -11,9 +11,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from splatwizard_core.base.files import file_sha256
+from splatwizard_core.base.progress import track
 from splatwizard_core.errors import SceneError
 from splatwizard_core.scene.scene import Scene, View
-from splatwizard_native import file_sha256, track
 
 SAMPLED_PICTURES = 8
 THREADS = 4  # hashing lets go of the interpreter; more than a disk can feed are of no use

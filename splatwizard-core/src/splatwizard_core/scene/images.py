@@ -9,8 +9,9 @@ from dataclasses import replace
 
 import torch
 
+from splatwizard_core.base.progress import track
 from splatwizard_core.scene.scene import View
-from splatwizard_native import available_cores, track
+from splatwizard_native import available_cores
 
 
 def decode_all(views: Iterable[View]) -> None:

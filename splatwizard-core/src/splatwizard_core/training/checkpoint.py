@@ -27,10 +27,10 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from splatwizard_core.base.block import Block
+from splatwizard_core.base.files import TEMPORARY, replacing
 from splatwizard_core.errors import CheckpointError
 from splatwizard_core.training.keys import dotted
 from splatwizard_core.training.measurements import TrainingFigures
-from splatwizard_native import TEMPORARY, replacing
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)

@@ -11,12 +11,13 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.base.interrupt import InterruptGuard
+from splatwizard_core.base.memory import synchronize
+from splatwizard_core.base.progress import track
 from splatwizard_core.base.random_states import preserved_random_states
 from splatwizard_core.base.scalars import read_scalars
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.training.state import TrainingState
 from splatwizard_core.training.timing import LoopClock
-from splatwizard_native import synchronize, track
 
 if TYPE_CHECKING:
     from splatwizard_core.training.pipeline import TrainingRun

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from splatwizard_core.base.memory import MemoryMeter
 from splatwizard_core.base.random_states import seeded
 from splatwizard_core.base.run_log import RunLog
 from splatwizard_core.errors import CheckpointError, ConfigError
@@ -36,7 +37,6 @@ from splatwizard_core.training.stage import Stage, StageContext
 from splatwizard_core.training.state import TrainingState
 from splatwizard_core.training.timing import StageClock
 from splatwizard_core.training.trainer import Trainer
-from splatwizard_native import MemoryMeter
 
 __all__ = ["TrainOutcome", "TrainingRun", "TrainingStopped"]
 

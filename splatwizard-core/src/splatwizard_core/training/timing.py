@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from splatwizard_native import synchronize, work_time
+from splatwizard_core.base.memory import synchronize
+from splatwizard_native import work_time
 
 STAGES = ("pre", "render", "loss", "backward", "post", "optimize")
 """The five stages of a step; the third is timed in two halves."""

@@ -15,14 +15,20 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.base.scalars import Verdict
-from splatwizard_core.errors import EmptyModel, NothingToDo, TaskError, TrainingDiverged
+from splatwizard_core.errors import (
+    DeviceMemoryError,
+    EmptyModel,
+    NothingToDo,
+    TaskError,
+    TrainingDiverged,
+    out_of_memory,
+)
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import View
 from splatwizard_core.training.losses import LossPack
 from splatwizard_core.training.state import TrainingState
 from splatwizard_core.training.task_log import TaskLog
 from splatwizard_core.training.timing import StageClock
-from splatwizard_native import DeviceMemoryError, out_of_memory
 
 CHECK_EVERY = 32
 """Steps between questions to a GPU whether the losses are finite; each is answered at the next one, so that none is

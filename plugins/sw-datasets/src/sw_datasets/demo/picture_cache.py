@@ -16,8 +16,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splatwizard_core.api import Camera
-from splatwizard_native import DiskFullError, cache_root, replacing
+from splatwizard_core.api import Camera, replacing
+from splatwizard_core.tooling import DiskFullError
+from splatwizard_native import cache_root
 
 FOLDER = "demo-pictures"
 """Below the folder of this user's caches; may be deleted at any time."""

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from splatwizard_core.api import Camera, Scene, SceneError, SceneOptions
-from splatwizard_native import json_reason
+from splatwizard_core.tooling import json_reason
 from sw_datasets.assemble import assemble_scene
 from sw_datasets.image_checks import Gate
 from sw_datasets.loaders.transforms import unused_keys

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from splatwizard_core.api import Camera, PointCloud, Scene, SceneError, SceneOptions, View
-from splatwizard_native import json_reason
+from splatwizard_core.tooling import json_reason
 from sw_datasets.assemble import assemble_scene
 from sw_datasets.families import TRANSFORMS
 from sw_datasets.image_checks import Gate

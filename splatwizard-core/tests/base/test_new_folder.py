@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from splatwizard_native.files import new_folder
+from splatwizard_core.base.files import new_folder
 
 
 def interrupted(path: Path) -> None:
@@ -56,7 +56,7 @@ def test_what_appeared_meanwhile_is_not_overwritten(tmp_path: Path):
 def test_what_a_killed_process_left_is_removed(tmp_path: Path):
     program = (
         "import os, sys\n"
-        "from splatwizard_native.files import new_folder\n"
+        "from splatwizard_core.base.files import new_folder\n"
         "with new_folder(sys.argv[1]) as folder:\n"
         "    (folder / 'half').write_text('half')\n"
         "    os.kill(os.getpid(), 9)\n"
