@@ -68,8 +68,8 @@ class Predicted:
     base            base step of the features, in which the networks of channels count
     smallest        floor of a probability
     smallest_scale  floor of a deviation, without gradient below
-    scale_floor     floor of a deviation in steps instead, with the gradient that raises it, and of a fifth of a number's way
-                    to its mean; 0: none
+    scale_floor     floor of a deviation in steps instead, with the gradient that raises it, and of a fifth of a
+                    number's way to its mean; 0: none
     masks           what they do
     """
 
