@@ -13,6 +13,7 @@ EXACT = NativeModule(
         "exact_kernels/face_mixtures.cpp",
         "exact_kernels/face_networks.cpp",
         "exact_kernels/face_planes.cpp",
+        "exact_kernels/face_sessions.cpp",
     ),
     kernels=(
         "exact_kernels/lattice.cpp",
@@ -24,6 +25,8 @@ EXACT = NativeModule(
         "exact_kernels/mixture_rows.cpp",
         "exact_kernels/octree.cpp",
         "exact_kernels/bits.cpp",
+        "exact_kernels/sessions.cpp",
+        "exact_kernels/leaf_octree.cpp",
     ),
     headers=("exact_kernels/*.h",),
     cflags=("-fno-math-errno", "-fno-trapping-math"),  # without these GCC keeps conversions out of vector code

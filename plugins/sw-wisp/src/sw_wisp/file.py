@@ -24,7 +24,8 @@ from sw_wisp import numbers
 from sw_wisp.cube import Cube, splat_cells
 from sw_wisp.decoded import Decoded
 from sw_wisp.eight_bits import EightBitLayer, pack_layers, unpack_layers
-from sw_wisp.nested import UNIT, Reader, Writer
+from sw_wisp.fast.streams import reader_of
+from sw_wisp.nested import UNIT, Writer
 from sw_wisp.numbers import GROUPS, NUMBERS
 from sw_wisp.octree import MOST_IN_A_CELL, Cells, file_order, fit_shares
 from sw_wisp.octree_contexts import Shares
@@ -178,7 +179,7 @@ def decode(reader: ContainerReader, *, packets: int | None = None) -> Decoded:
     for number, packet in enumerate(header.packets):
         with reader.decoding(section_name(number)) as data:
             if number < len(taken):
-                stream = Reader(data)
+                stream = reader_of(data)
                 walk.packet(stream, packet)
                 stream.finish()
     walk.finish()
@@ -295,7 +296,7 @@ def _array(values: Tensor | np.ndarray) -> np.ndarray:
 def _decoded(context: Context, shares: Shares, planes: int, packets: Sequence[Packet], data: Sequence[bytes]) -> Any:
     walk = Walk(context, shares, planes)
     for packet, section in zip(packets, data, strict=True):
-        stream = Reader(section)
+        stream = reader_of(section)
         walk.packet(stream, packet)
         stream.finish()
     return walk.state

@@ -45,9 +45,9 @@ def plain_gaussians(
     log_edges   [N] logarithms of the edges of their cells
     """
     opacity, shape, size, colour, latents = (values[:, group.columns] for group in GROUPS)
-    shape, size = bounded(shape, size.squeeze(1) + log_edges, *bounds_in(cube))
-    rest = network(latents, colour)
-    return GaussianModel.from_tensors(means, sh_dc_of(colour), rest, opacity.squeeze(1), *scales_and_quats(shape, size))
+    log_scales, quats = scales_and_quats(shape, size.squeeze(1) + log_edges)
+    log_scales, rest = log_scales.clamp(*bounds_in(cube)), network(latents, colour)
+    return GaussianModel.from_tensors(means, sh_dc_of(colour), rest, opacity.squeeze(1), log_scales, quats)
 
 
 class WispModel(SplatModel):

@@ -56,8 +56,8 @@ class Stream(ABC):
         """Bits bool [n]; `ones` [n] in 1..4095 are 4096 times their probabilities of being 1."""
 
     @abstractmethod
-    def entries(self, level: int, count: int, wanted: np.ndarray | None) -> np.ndarray:
-        """Entries int64 [count] of one table, 0..2R + 1."""
+    def entries(self, tables: np.ndarray, wanted: np.ndarray | None) -> np.ndarray:
+        """Entries int64 [n], 0..2R + 1 each, of tables uint8 [n]: table by table."""
 
     @abstractmethod
     def choices(self, counts: np.ndarray, wanted: np.ndarray | None) -> np.ndarray:
@@ -69,15 +69,10 @@ class Stream(ABC):
         given = None if wanted is None else np.asarray(wanted, np.int64).reshape(-1)
         if given is not None and np.abs(given).max(initial=0) >= INDEX_LIMIT:
             raise ValueError(f"an index of {np.abs(given).max():,} is beyond {INDEX_LIMIT:,} steps")
-        radius = exact_tables().gaussian.radius[flat]
-        found, outside = np.empty(len(flat), np.int64), np.zeros(len(flat), bool)
-        for level, rows in _by_table(flat):
-            window = int(exact_tables().gaussian.radius[level])
-            entry = None
-            if given is not None:
-                entry = np.where(np.abs(given[rows]) > window, 2 * window + 1, given[rows] + window)
-            entry = self.entries(level, len(rows), entry)
-            found[rows], outside[rows] = entry - window, entry > 2 * window
+        radius = exact_tables().gaussian.radius[flat].astype(np.int64)
+        entry = None if given is None else np.where(np.abs(given) > radius, 2 * radius + 1, given + radius)
+        entry = self.entries(flat, entry)
+        found, outside = entry - radius, entry > 2 * radius
         escaped = np.flatnonzero(outside)
         if len(escaped):
             found[escaped] = self._escapes(radius[escaped], None if given is None else given[escaped])
@@ -133,9 +128,11 @@ class Writer(Stream):
         assert wanted is not None
         return self._put(wanted, _models.Bernoulli(perfect=False), ones / UNIT)
 
-    def entries(self, level: int, count: int, wanted: np.ndarray | None) -> np.ndarray:
+    def entries(self, tables: np.ndarray, wanted: np.ndarray | None) -> np.ndarray:
         assert wanted is not None
-        return self._put(wanted, _table(level))
+        for level, rows in _by_table(tables):
+            self._put(wanted[rows], _table(level))
+        return wanted
 
     def choices(self, counts: np.ndarray, wanted: np.ndarray | None) -> np.ndarray:
         assert wanted is not None
@@ -176,8 +173,11 @@ class Reader(Stream):
     def bits(self, ones: np.ndarray, wanted: np.ndarray | None) -> np.ndarray:
         return self._get(len(ones), _models.Bernoulli(perfect=False), ones / UNIT) == 1
 
-    def entries(self, level: int, count: int, wanted: np.ndarray | None) -> np.ndarray:
-        return self._get(count, _table(level))
+    def entries(self, tables: np.ndarray, wanted: np.ndarray | None) -> np.ndarray:
+        found = np.empty(len(tables), np.int64)
+        for level, rows in _by_table(tables):
+            found[rows] = self._get(len(rows), _table(level))
+        return found
 
     def choices(self, counts: np.ndarray, wanted: np.ndarray | None) -> np.ndarray:
         return self._get(len(counts), _models.Categorical(perfect=False), counts)
@@ -199,10 +199,11 @@ class Counter(Stream):
         self.total += float(-np.log2(np.where(wanted, ones, UNIT - ones) / UNIT).sum())
         return wanted
 
-    def entries(self, level: int, count: int, wanted: np.ndarray | None) -> np.ndarray:
+    def entries(self, tables: np.ndarray, wanted: np.ndarray | None) -> np.ndarray:
         assert wanted is not None
-        counts = exact_tables().gaussian.counts[level * FRACTIONS + CENTRED]
-        self.total += float(-np.log2(counts[wanted] / counts.sum()).sum())
+        for level, rows in _by_table(tables):
+            counts = exact_tables().gaussian.counts[level * FRACTIONS + CENTRED]
+            self.total += float(-np.log2(counts[wanted[rows]] / counts.sum()).sum())
         return wanted
 
     def choices(self, counts: np.ndarray, wanted: np.ndarray | None) -> np.ndarray:

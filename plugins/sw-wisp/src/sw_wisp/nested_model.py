@@ -12,7 +12,8 @@ from splatwizard_core.api import BitstreamError
 from sw_codecs.bits import checksum
 from sw_codecs.bits.packing import ByteReader
 from sw_wisp import rate
-from sw_wisp.nested import Reader, Writer, table_levels
+from sw_wisp.fast.streams import reader_of
+from sw_wisp.nested import Writer, table_levels
 
 
 class NestedGaussian:
@@ -35,7 +36,7 @@ class NestedGaussian:
         """Indices int64 in the shape of the context. Raises BitstreamError."""
         reader = ByteReader(data)
         crc = reader.integer(4)
-        stream = Reader(reader.take(reader.left))
+        stream = reader_of(reader.take(reader.left))
         found = stream.indices(table_levels(np.asarray(context)), None)
         stream.finish()
         if _crc(found) != crc:

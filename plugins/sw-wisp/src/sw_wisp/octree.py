@@ -19,6 +19,7 @@ import numpy as np
 
 from splatwizard_core.api import BitstreamError
 from sw_codecs.positions import morton
+from sw_wisp.fast.streams import FastReader
 from sw_wisp.nested import UNIT, Stream
 from sw_wisp.numbers import HIGHEST_LEVEL, LOWEST_LEVEL
 from sw_wisp.octree_contexts import CONTEXTS, ENDS, LEVELS, MORE, ON, Around, Shares
@@ -210,7 +211,7 @@ def walk(
         if left < len(nodes):
             raise BitstreamError(f"the octree has more than the {rows:,} splats that were announced")
     if left:
-        raise BitstreamError(f"the octree lacks {left:,} of the {rows:,} splats that were announced")
+        raise BitstreamError(f"the octree has fewer than the {rows:,} splats that were announced")
     cells = joined(found)
     order = np.lexsort((cells.levels, cells.finest))
     return cells.part(order), np.concatenate(costs)[order]
@@ -233,6 +234,9 @@ def fit_shares(subsets: Sequence[Cells]) -> Shares:
 
 def code_cells(stream: Stream, shares: Shares, rows: int, earlier: Cells, wanted: Cells | None) -> Cells:
     """Write, read or count one subset; see `walk`."""
+    if isinstance(stream, FastReader) and rows:
+        earlier_cells = [earlier.at(level) for level in range(LOWEST_LEVEL, HIGHEST_LEVEL + 1)]
+        return Cells(*stream.leaf_octree(shares.ones, rows, earlier_cells))
     return walk(lambda contexts, bits: stream.bits(shares.ones[contexts], bits), rows, earlier, wanted)[0]
 
 

@@ -55,6 +55,7 @@ class PyramidContext:
     _networks: list[IntegerMlp] = field(init=False, repr=False)
     _pyramid: Pyramid = field(init=False, repr=False)
     _features: torch.Tensor = field(init=False, repr=False)
+    _room: torch.Tensor = field(init=False, repr=False)
 
     kind = "pyramid"
     waves = WAVES
@@ -66,6 +67,7 @@ class PyramidContext:
 
     def start(self) -> None:
         """Forget all splats."""
+        self._room = torch.empty(0, FEATURES, dtype=torch.int64)
         self._pyramid = Pyramid(torch.from_numpy(self.prior))
 
     def predict(self, block: slice, rows: np.ndarray, state: State) -> Prediction:
@@ -75,7 +77,10 @@ class PyramidContext:
             self._pyramid.announce(*(torch.from_numpy(each[known:]) for each in (state.levels, state.cells.codes)))
         number, width = BLOCKS.index(block), block.stop - block.start
         if number == 0 or block == VIEW:
-            self._features = self._pyramid.features(torch.from_numpy(rows))  # B and C follow A with the same rows
+            if len(self._room) < len(rows):  # half of all rows are in the last part
+                self._room = torch.empty(max(len(rows), (len(state.levels) + 1) // 2), FEATURES, dtype=torch.int64)
+            # B and C follow A with the same rows.
+            self._features = self._pyramid.features(torch.from_numpy(rows), out=self._room)
         further = torch.from_numpy(state.units(rows, slice(0, block.start))) if number else None
         out = self._networks[number](self._features, further).numpy()
         mean = self._features[:, block].numpy() + out[:, :width]

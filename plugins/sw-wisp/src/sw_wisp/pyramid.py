@@ -18,6 +18,8 @@ import torch
 from sw_gaussians.morton import interleave
 from torch import Tensor
 
+from sw_wisp.fast import running_means
+from sw_wisp.fast.exact_native import EXACT
 from sw_wisp.nested import UNIT
 from sw_wisp.numbers import HIGHEST_LEVEL, LATENTS, NUMBERS
 from sw_wisp.packets import REFINED, VALUE_LIMIT, default_order, waves
@@ -53,6 +55,8 @@ class Pyramid:
         self._known = [False, False]
         activity = torch.full((NUMBERS,), SIXTEENTH, device=device)
         self._prior = [torch.cat([prior[p], activity[p]]).double() for p in PARTS]
+        self._room = torch.empty(0, 2 * NUMBERS, dtype=torch.float64)
+        self._has_kernels = device.type == "cpu" and EXACT.try_load()
 
     def __len__(self) -> int:
         return len(self._levels)
@@ -120,6 +124,11 @@ class Pyramid:
     def _spread(self, rows: Tensor, part: int, columns: slice, table: Tensor) -> None:
         if not len(rows):
             return
+        if self._has_kernels:
+            running_means.add(
+                rows, self._leaf, self._parent, table, columns.start or 0, self._own[part], self._sums[part]
+            )
+            return
         self._own[part][rows, columns] += table.float()
         cells = table.new_zeros(len(self._parent), table.shape[1]).index_add_(0, self._leaf[rows], table)
         for level in range(DEEPEST, 0, -1):  # each cell's sum to its parent
@@ -127,8 +136,19 @@ class Pyramid:
             cells.index_add_(0, self._parent[own], cells[own].clone())
         self._sums[part][:, columns] += cells
 
-    def features(self, rows: Tensor) -> Tensor:
-        """Features int64 [n,69] of some splats, 12 fractional bits."""
+    def features(self, rows: Tensor, out: Tensor | None = None) -> Tensor:
+        """Features int64 [n,69] of some splats, 12 fractional bits.
+
+        out     int64 [n or more, 69] on the CPU that may take them: fresh memory costs twice what is computed in it
+        """
+        if self._has_kernels and len(rows):
+            if len(self._room) < len(self._keys):
+                self._room = torch.empty(len(self._keys), 2 * NUMBERS, dtype=torch.float64)
+            found = rows.new_empty(len(rows), FEATURES) if out is None else out[: len(rows)]
+            cells = (self._levels, self._leaf, self._parent, self._depth, self._starts)
+            sums = [sums if known else None for sums, known in zip(self._sums, self._known, strict=True)]
+            running_means.features(rows, cells, self._prior, sums, self._room, found)
+            return found
         levels, leaf = self._levels[rows], self._leaf[rows]
         depth = self._depth[leaf]
         ways = [leaf]

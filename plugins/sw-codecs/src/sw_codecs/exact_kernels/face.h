@@ -169,6 +169,69 @@ typedef struct {
 } decode_bits_call;
 SW_OPERATION(sw_codecs_exact, decode_bits);
 
+// Symbols of several models from one stream of range-coded words: each call goes on where the one before ended, which
+// `state` tells: low, range, point and how many words were read.
+
+// Bits, each under its own share of 0.
+typedef struct {
+  sw_head head;
+  const uint8_t* words;       // [bytes]
+  int64_t bytes;
+  int64_t* state;             // [4]
+  const int32_t* zeros;       // [count] 1 .. 2^24 - 1
+  bool* bits;                 // [count]
+  int64_t count;
+  int32_t status;             // out
+} range_bits_call;
+SW_OPERATION(sw_codecs_exact, range_bits);
+
+// Entries of tables, table by table.
+typedef struct {
+  sw_head head;
+  const int32_t* shares;      // [numbers]
+  const int32_t* first;       // [512]
+  const int32_t* radius;      // [512]
+  const uint16_t* bucket;     // [512, 256]
+  const uint8_t* words;       // [bytes]
+  int64_t bytes;
+  int64_t* state;             // [4]
+  const int16_t* number;      // [count] 0 .. 511
+  int32_t* entries;           // [count]
+  int64_t numbers, count;
+  int32_t status;             // out
+} range_entries_call;
+SW_OPERATION(sw_codecs_exact, range_entries);
+
+// Which of three, under counts of each symbol.
+typedef struct {
+  sw_head head;
+  const uint8_t* words;       // [bytes]
+  int64_t bytes;
+  int64_t* state;             // [4]
+  const double* counts;       // [count, 3] above 0
+  int32_t* entries;           // [count]
+  int64_t count;
+  int32_t status;             // out
+} range_choices_call;
+SW_OPERATION(sw_codecs_exact, range_choices);
+
+// Cells of splats of a subset, in the order of the file.
+typedef struct {
+  sw_head head;
+  const uint8_t* words;       // [bytes]
+  int64_t bytes;
+  int64_t* state;             // [4]
+  const int32_t* zeros;       // [2960] shares of 0 by level 3 .. 18 and context
+  const int64_t* known_start;   // [17] first of the known cells of each level, and how many there are
+  const int64_t* known_cells;   // [known] Morton codes, ascending at each level
+  const int64_t* known_counts;  // [known] splats of earlier subsets in each
+  int64_t known, rows;
+  int64_t* levels;            // [rows]
+  int64_t* codes;             // [rows] Morton codes at these levels
+  int32_t status;             // out
+} decode_leaf_octree_call;
+SW_OPERATION(sw_codecs_exact, decode_leaf_octree);
+
 // Outputs of a network of integers. Inputs are `inputs` and `further` side by side, or `short_inputs`.
 typedef struct {
   sw_head head;

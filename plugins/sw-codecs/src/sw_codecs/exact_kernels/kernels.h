@@ -17,7 +17,8 @@ enum Status : int32_t {
   WORDS_LEFT = 1,      // coded words are left, or the state is not what the encoder began with
   ESCAPES_WRONG = 2,   // escape codes are damaged, too few or too many
   BEYOND_LIMIT = 3,    // a symbol, or the integer part of a mean, is too large
-  PARAMETER_WRONG = 4  // mean, scale or multiplier is out of range
+  PARAMETER_WRONG = 4,  // mean, scale or multiplier is out of range
+  TOO_FEW = 5           // there are fewer than were announced
 };
 
 // The 512 tables of a family as shares of 2^24.

@@ -27,6 +27,18 @@ class decode_octree_call(Structure):
 class decode_bits_call(Structure):
     status: int
 
+class range_bits_call(Structure):
+    status: int
+
+class range_entries_call(Structure):
+    status: int
+
+class range_choices_call(Structure):
+    status: int
+
+class decode_leaf_octree_call(Structure):
+    status: int
+
 class forecast_call(Structure):
     status: int
 
@@ -174,6 +186,52 @@ def decode_bits(
     bits: Tensor | Array[Any] | int,
     count: int | None = None,
 ) -> decode_bits_call: ...
+def range_bits(
+    *,
+    words: Tensor | Array[Any] | int,
+    bytes: int | None = None,
+    state: Tensor | Array[Any] | int,
+    zeros: Tensor | Array[Any] | int,
+    bits: Tensor | Array[Any] | int,
+    count: int | None = None,
+) -> range_bits_call: ...
+def range_entries(
+    *,
+    shares: Tensor | Array[Any] | int,
+    first: Tensor | Array[Any] | int,
+    radius: Tensor | Array[Any] | int,
+    bucket: Tensor | Array[Any] | int,
+    words: Tensor | Array[Any] | int,
+    bytes: int | None = None,
+    state: Tensor | Array[Any] | int,
+    number: Tensor | Array[Any] | int,
+    entries: Tensor | Array[Any] | int,
+    numbers: int | None = None,
+    count: int | None = None,
+) -> range_entries_call: ...
+def range_choices(
+    *,
+    words: Tensor | Array[Any] | int,
+    bytes: int | None = None,
+    state: Tensor | Array[Any] | int,
+    counts: Tensor | Array[Any] | int,
+    entries: Tensor | Array[Any] | int,
+    count: int | None = None,
+) -> range_choices_call: ...
+def decode_leaf_octree(
+    *,
+    words: Tensor | Array[Any] | int,
+    bytes: int | None = None,
+    state: Tensor | Array[Any] | int,
+    zeros: Tensor | Array[Any] | int,
+    known_start: Tensor | Array[Any] | int,
+    known_cells: Tensor | Array[Any] | int,
+    known_counts: Tensor | Array[Any] | int,
+    known: int | None = None,
+    rows: int | None = None,
+    levels: Tensor | Array[Any] | int,
+    codes: Tensor | Array[Any] | int,
+) -> decode_leaf_octree_call: ...
 def network(
     *,
     inputs: Tensor | Array[Any] | int | None = None,

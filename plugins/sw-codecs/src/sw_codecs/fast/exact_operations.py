@@ -122,6 +122,59 @@ def decode_bits(words: Tensor, zeros: int, count: int) -> tuple[Tensor, int]:
     return bits, face.decode_bits(words=words, zeros=zeros, bits=bits).status
 
 
+class RangeSession:
+    """Symbols of several models from one stream of range-coded words, each call behind the one before.
+
+    words   uint8, whole 32-bit words, little-endian
+    """
+
+    def __init__(self, words: Tensor) -> None:
+        self._words = words
+        first = int.from_bytes(words[:4].numpy().tobytes(), "little")
+        second = int.from_bytes(words[4:8].numpy().tobytes(), "little")
+        point = first << 32 | second
+        read = min(len(words) // 4, 2)
+        self._state = torch.tensor([0, -1, point - (point >> 63 << 64), read])  # low, range, point, words read
+
+    def bits(self, zeros: Tensor) -> tuple[Tensor, int]:
+        """Return (bits bool [n], status) under shares int32 [n] of 0, of 2^24."""
+        bits = torch.empty(len(zeros), dtype=torch.bool)
+        return bits, face.range_bits(words=self._words, state=self._state, zeros=zeros, bits=bits).status
+
+    def entries(self, tables: Sequence[Tensor], number: Tensor) -> tuple[Tensor, int]:
+        """Return (entries int32 [n], status) under table `number` int16 [n] each, coded table by table."""
+        entries = torch.empty(len(number), dtype=torch.int32)
+        call = face.range_entries(
+            **_named(tables), words=self._words, state=self._state, number=number, entries=entries
+        )
+        return entries, call.status
+
+    def choices(self, counts: Tensor) -> tuple[Tensor, int]:
+        """Return (int32 [n] in 0..2, status) under counts float64 [n,3]."""
+        entries = torch.empty(len(counts), dtype=torch.int32)
+        return entries, face.range_choices(words=self._words, state=self._state, counts=counts, entries=entries).status
+
+    def leaf_octree(self, zeros: Tensor, rows: int, known: Sequence[Tensor]) -> tuple[Tensor, Tensor, int]:
+        """Return (levels, Morton codes int64 [rows], status) of a subset of splats.
+
+        zeros   [16 * 185] int32 shares of 0 by level and context
+        known   [17] int64 where the cells of each level begin; the cells, ascending; splats in each
+        """
+        start, cells, counts = known
+        levels, codes = torch.empty(rows, dtype=torch.int64), torch.empty(rows, dtype=torch.int64)
+        call = face.decode_leaf_octree(
+            words=self._words, state=self._state, zeros=zeros, known_start=start, known_cells=cells,
+            known_counts=counts, levels=levels, codes=codes,
+        )  # fmt: skip
+        return levels, codes, call.status
+
+    @property
+    def is_used_up(self) -> bool:
+        """Whether the last word was read and what is left of it needs no further symbol."""
+        low, _, point, read = self._state.tolist()
+        return bool(read == len(self._words) // 4 and (point - low) % (1 << 64) < 1 << 33)
+
+
 def network(inputs: Sequence[Tensor], weights: Tensor, widths: Tensor, leak: int, outputs: Tensor) -> None:
     """Write outputs [n, out] int64 of a network on one or two inputs side by side.
 

@@ -1,0 +1,14 @@
+// The kernels of running means, declared once for every instruction set that they are compiled for. All numbers are
+// whole and below 2^53: the results depend on no order, no number of threads and no instruction set.
+#pragma once
+#include <splatwizard/dispatch.h>
+#include <splatwizard/parallel.h>
+
+#include "face.h"
+
+#define SW_DECLARE_WISP(arch)                                                                     \
+  namespace arch {                                                                                \
+  void pyramid_features(const pyramid_features_call&, const splatwizard::Parallel&);              \
+  void pyramid_add(const pyramid_add_call&, const splatwizard::Parallel&);                        \
+  }
+SW_FOR_EACH_ARCH(SW_DECLARE_WISP)

@@ -1,0 +1,16 @@
+"""Native module of the file's integers: running means of splats, on all cores."""
+
+from __future__ import annotations
+
+from splatwizard_native import NativeModule
+
+EXACT = NativeModule(
+    name="sw_wisp_exact",
+    package="sw_wisp",
+    face="exact_kernels/face.h",
+    sources=("exact_kernels/face.cpp",),
+    kernels=("exact_kernels/pyramid.cpp",),
+    headers=("exact_kernels/*.h",),
+    cflags=("-fno-math-errno", "-fno-trapping-math"),  # without these GCC keeps floor out of vector code
+    without="files of wisp are decoded by torch operations: the same integers, two to three times slower",
+)
