@@ -124,7 +124,7 @@ class ExactTables:
         self.version = file.one("H")
         file.one("I")
         self.multipliers = file.unpack("128H")
-        file.take(64 * 4)  # scales: for encoders
+        self.deviations = [scale / 2**20 for scale in file.unpack("64I")]
         self.thresholds = file.unpack("63I")
         self.radius, self.tables = {}, {}
         for family in ("gaussian", "laplace"):

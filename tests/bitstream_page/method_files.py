@@ -11,6 +11,7 @@ from bitstream_page.container import container
 from bitstream_page.entropy_models import ExactTables
 from bitstream_page.fields import check
 from bitstream_page.gaussian_files import chimera, compact, exact_mode, indexed, packed, ply, quantized, raht, vectree
+from bitstream_page.splat_files import wisp
 
 
 def decode(data: bytes, unzstd: Callable[[bytes], bytes], tables: ExactTables) -> dict[str, np.ndarray]:
@@ -24,6 +25,8 @@ def decode(data: bytes, unzstd: Callable[[bytes], bytes], tables: ExactTables) -
         return hac_plus(static, sections, tables)
     if header["method"] == "cat-3dgs":
         return cat(static, sections, tables)
+    if header["method"] == "wisp":
+        return wisp(static, sections, tables)
     if header["method"] == "3dgs":
         check(static["mode"] in ("exact", "quantized"), "mode")
         return exact_mode(static, sections) if static["mode"] == "exact" else quantized(static, sections)
