@@ -6,6 +6,7 @@ A few hundred files in the default tests; more with `python -m pytest -m fuzz pl
 
 import os
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,8 +16,12 @@ from test_context import some_networks
 from wisp_scenes import made_up
 
 from splatwizard_core.api import BitstreamError, ContainerReader, ContainerWriter
-from sw_wisp import file
-from sw_wisp.nested import Writer
+from sw_codecs.exact_native import EXACT as CODECS
+from sw_wisp import file, pyramid
+from sw_wisp.fast import streams
+from sw_wisp.fast.exact_native import EXACT
+from sw_wisp.nested import Reader, Writer
+from sw_wisp.octree import Cells, code_cells, fit_shares, joined
 from sw_wisp.octree_contexts import ENDS, LEVELS, MORE, Shares
 
 NOISE = 16 << 20  # of the allocator, and of the tables that are made once
@@ -61,11 +66,51 @@ def fuzz(seeds: list[bytes], number: int, seed: int) -> Tally:
     return tally
 
 
-def test_a_few_hundred_hostile_files(seeds):
-    tally = fuzz(seeds, 400, 1)
+@pytest.mark.parametrize("decoder", ["compiled", "plain"])
+def test_a_few_hundred_hostile_files(seeds, monkeypatch, decoder):
+    if decoder == "plain":
+        for module in (streams, pyramid):
+            monkeypatch.setattr(module, "EXACT", SimpleNamespace(try_load=lambda: False))
+    elif not (CODECS.try_load() and EXACT.try_load()):
+        pytest.skip("there are no compiled kernels")
+    tally = fuzz(seeds, 250, 1)
     assert tally.problems == []
-    assert tally.outcomes["refused"] > 150
-    assert tally.outcomes["decoded"] > 20
+    assert tally.outcomes["refused"] > 90
+    assert tally.outcomes["decoded"] > 12
+
+
+@pytest.mark.parametrize("claim", [(0, 16, 1), (5, 4, 1), (0, 3, 2), (255, 255, 3)])
+def test_levels_beyond_the_octree_are_refused(seeds, claim):
+    parts = Parts.of(seeds[0])
+    sections = dict(parts.sections)
+    sections["networks"] = bytes(claim) + sections["networks"][3:]
+    parts.sections = list(sections.items())
+    with pytest.raises(BitstreamError, match="octree is said to have"):
+        decoded(parts.join())
+
+
+@pytest.mark.parametrize("ahead", ["fine", "view"])
+def test_packets_before_their_base_are_refused(seeds, ahead):
+    parts = Parts.of(seeds[1])
+    order = parts.header["static"]["order"]
+    place = next(i for i, (subset, kind, _) in enumerate(order) if (subset, kind) == (2, ahead))
+    order.insert(0, order.pop(place))
+    with pytest.raises(BitstreamError, match="subset 2 has the packets"):
+        decoded(parts.join())
+
+
+def test_no_cell_can_hold_seventeen():
+    """There is no bit for a seventeenth: what says "one more" to the end stands for sixteen."""
+    cells = Cells(np.full(16, 3), np.full(16, 77))
+    shares, writer = fit_shares([cells]), Writer()
+    code_cells(writer, shares, 16, joined([]), cells)
+    data = writer.finish()
+    for reader in (Reader(data), streams.reader_of(data)):
+        assert np.array_equal(code_cells(reader, shares, 16, joined([]), None).codes, cells.codes)
+        reader.finish()
+    for reader in (Reader(data), streams.reader_of(data)):
+        with pytest.raises(BitstreamError):
+            code_cells(reader, shares, 17, joined([]), None)
 
 
 @pytest.mark.slow
