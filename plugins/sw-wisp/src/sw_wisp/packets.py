@@ -82,7 +82,9 @@ class State:
         start, more = len(self.cells), len(cells)
         self.cells = joined([self.cells, cells])
         for name in (*PARAMETERS, "index"):
-            setattr(self, name, np.concatenate([getattr(self, name), np.zeros((more, NUMBERS), np.int32)]))
+            known, table = getattr(self, name), np.zeros((start + more, NUMBERS), np.int32)
+            table[:start] = known
+            setattr(self, name, table)
         self.planes = np.concatenate([self.planes, np.full(more, planes, np.int8)])
         self.has_view = np.concatenate([self.has_view, np.zeros(more, bool)])
         return np.arange(start, start + more)

@@ -112,22 +112,26 @@ class Pyramid:
 
     def add(self, rows: Tensor, part: slice, values: Tensor, indices: Tensor) -> None:
         """Take in the columns `part`, BASE or VIEW, of splats that became known: values and indices [n,c]."""
+        number = PARTS.index(part)
+        self._known[number] = True
+        if self._has_kernels:
+            running_means.add(rows, self._leaf, self._parent, values, indices, 0, self._own[number], self._sums[number])
+            return
         activity = indices.abs().clamp_max(MOST_ACTIVE) * SIXTEENTH
         table = torch.cat([bounded(values), activity.double(), activity.new_ones(len(rows), 1).double()], dim=1)
-        self._known[PARTS.index(part)] = True
-        self._spread(rows, PARTS.index(part), slice(None), table)
+        self._spread(rows, number, slice(None), table)
 
     def refine(self, rows: Tensor, columns: slice, before: Tensor, after: Tensor) -> None:
         """Values [n,c] of columns of BASE became finer; activities stay what they were."""
-        self._spread(rows, 0, columns, bounded(after) - bounded(before))
+        change = bounded(after) - bounded(before)
+        if self._has_kernels:
+            first = columns.start
+            running_means.add(rows, self._leaf, self._parent, change, None, first, self._own[0], self._sums[0])
+            return
+        self._spread(rows, 0, columns, change)
 
     def _spread(self, rows: Tensor, part: int, columns: slice, table: Tensor) -> None:
         if not len(rows):
-            return
-        if self._has_kernels:
-            running_means.add(
-                rows, self._leaf, self._parent, table, columns.start or 0, self._own[part], self._sums[part]
-            )
             return
         self._own[part][rows, columns] += table.float()
         cells = table.new_zeros(len(self._parent), table.shape[1]).index_add_(0, self._leaf[rows], table)

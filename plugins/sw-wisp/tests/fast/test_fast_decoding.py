@@ -162,7 +162,7 @@ def test_running_means_and_features_are_the_same_integers(plain):
 def test_senseless_calls_are_refused():
     shape = {
         "cells": 1,
-        "table": torch.zeros(1, 2).double(),
+        "values": torch.zeros(1, 2).long(),
         "own": torch.zeros(3, 4),
         "sums": torch.zeros(2, 4).double(),
     }

@@ -35,8 +35,9 @@ SW_OPERATION(sw_wisp_exact, pyramid_features) {
 SW_OPERATION(sw_wisp_exact, pyramid_add) {
   return guarded(call, [&](const Parallel& parallel) {
     check(call);
-    if (call->first < 0 || call->columns < 0 || call->first + call->columns > call->width)
-      refuse("columns %lld .. %lld of %lld", (long long)call->first, (long long)(call->first + call->columns),
+    const int64_t added = call->indices != nullptr ? 2 * call->columns + 1 : call->columns;
+    if (call->first < 0 || call->columns < 0 || added > 32 || call->first + added > call->width)
+      refuse("columns %lld .. %lld of %lld", (long long)call->first, (long long)(call->first + added),
              (long long)call->width);
     SW_SELECT(pyramid_add)(*call, parallel);
   });

@@ -25,14 +25,16 @@ typedef struct {
 } pyramid_features_call;
 SW_OPERATION(sw_wisp_exact, pyramid_features);
 
-// Adds rows of a table to the own numbers of splats, and to the sums of all cells around them.
+// Adds values to the own numbers of splats and to the sums of all cells around them: with indices values within +-2^20,
+// activities, and a count; else differences, to columns `first` and on.
 typedef struct {
   sw_head head;
   const int64_t* rows;        // [n]
   const int64_t* leaf;        // [splats]
   const int64_t* parent;      // [cells + 1]
-  const double* table;        // [n, columns] whole numbers
-  int64_t first;              // column of the sums that the table begins at
+  const int64_t* values;      // [n, columns]
+  const int64_t* indices;     // [n, columns] or null
+  int64_t first;              // column of the sums that values begin at
   int64_t n, splats, cells, columns, width;
   float* own;                 // [splats, width]
   double* sums;               // [cells + 1, width]

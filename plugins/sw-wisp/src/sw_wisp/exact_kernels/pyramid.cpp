@@ -11,6 +11,7 @@ using splatwizard::Parallel;
 namespace {
 
 constexpr int64_t DEEPEST = 15, BASE = 10, VIEW = 12, MEANS = 2 * (BASE + VIEW), FEATURES = 69;
+constexpr int64_t MOST_ACTIVE = 15;
 constexpr double PULL = 2, LIMIT = 1 << 20, SIXTEENTH = 256, MOST_COUNTED = 15;
 
 // M = floor((sum + 2 M of the parent) / (n + 2)); as the parent where nothing is known.
@@ -81,10 +82,20 @@ void pyramid_features(const pyramid_features_call& a, const Parallel& parallel) 
 }
 
 void pyramid_add(const pyramid_add_call& a, const Parallel& parallel) {
-  parallel(a.columns, 4, [&](int64_t begin, int64_t end) {  // no two threads have a column in common
+  const int64_t columns = a.columns, added = a.indices != nullptr ? 2 * columns + 1 : columns;
+  parallel(added, 4, [&](int64_t begin, int64_t end) {  // no two threads have a column in common
     for (int64_t i = 0; i < a.n; ++i) {
+      double from[32];
+      for (int64_t c = 0; c < columns; ++c) from[c] = static_cast<double>(a.values[columns * i + c]);
+      if (a.indices != nullptr) {
+        for (int64_t c = 0; c < columns; ++c) {
+          const int64_t k = a.indices[columns * i + c], size = k < 0 ? -k : k;
+          from[c] = from[c] < -LIMIT ? -LIMIT : from[c] > LIMIT ? LIMIT : from[c];
+          from[columns + c] = static_cast<double>(size < MOST_ACTIVE ? size : MOST_ACTIVE) * SIXTEENTH;
+        }
+        from[2 * columns] = 1;
+      }
       const int64_t row = a.rows[i];
-      const double* from = a.table + a.columns * i;
       float* own = a.own + a.width * row + a.first;
       for (int64_t c = begin; c < end; ++c) own[c] += static_cast<float>(from[c]);
       for (int64_t at = a.leaf[row];; at = a.parent[at]) {

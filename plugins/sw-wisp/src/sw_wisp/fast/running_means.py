@@ -10,11 +10,20 @@ from torch import Tensor
 from sw_wisp.fast import exact_face
 
 
-def add(rows: Tensor, leaf: Tensor, parent: Tensor, table: Tensor, first: int, own: Tensor, sums: Tensor) -> None:
-    """Add rows of a table [n,c] to columns `first` and on of the own numbers of splats and of all cells around them."""
+def add(
+    rows: Tensor, leaf: Tensor, parent: Tensor, values: Tensor, indices: Tensor | None, first: int, own: Tensor,
+    sums: Tensor,
+) -> None:  # fmt: skip
+    """Add numbers of splats [n,c] to columns `first` and on of their own numbers and of the sums of all cells around.
+
+    values  whole numbers
+    indices of splats that become known: activities and a count follow, and values are kept in their range; None:
+            `values` are differences
+    """
     exact_face.pyramid_add(
-        rows=rows.contiguous(), leaf=leaf, parent=parent, table=table.contiguous(), first=first, cells=len(parent) - 1,
-        own=own, sums=sums,
+        rows=rows.contiguous(), leaf=leaf, parent=parent, values=values.long().contiguous(),
+        indices=None if indices is None else indices.long().contiguous(), first=first, cells=len(parent) - 1, own=own,
+        sums=sums,
     )  # fmt: skip
 
 
