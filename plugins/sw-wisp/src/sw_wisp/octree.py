@@ -24,7 +24,7 @@ from sw_wisp.nested import UNIT, Stream
 from sw_wisp.numbers import HIGHEST_LEVEL, LOWEST_LEVEL
 from sw_wisp.octree_contexts import CONTEXTS, ENDS, LEVELS, MORE, ON, Around, Shares
 
-MOST_IN_A_CELL = 16
+MOST_IN_A_CELL, EVERY_LEVEL = 16, range(LOWEST_LEVEL, HIGHEST_LEVEL + 1)
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ def walk(
     paid = np.zeros(64)  # by each splat in the node, so far
     inside = np.ones(64) if wanted is None else np.bincount(wanted.at(LOWEST_LEVEL - 1), minlength=64)
     found, costs, left = [Cells(np.empty(0, np.int64), np.empty(0, np.int64))], [np.empty(0)], rows
-    for level in range(LOWEST_LEVEL, HIGHEST_LEVEL + 1):
+    for level in EVERY_LEVEL:
         if not len(nodes):
             break
         base, truth = (level - LOWEST_LEVEL) * CONTEXTS, None if wanted is None else _Truth(wanted, level)
@@ -235,8 +235,7 @@ def fit_shares(subsets: Sequence[Cells]) -> Shares:
 def code_cells(stream: Stream, shares: Shares, rows: int, earlier: Cells, wanted: Cells | None) -> Cells:
     """Write, read or count one subset; see `walk`."""
     if isinstance(stream, FastReader) and rows:
-        earlier_cells = [earlier.at(level) for level in range(LOWEST_LEVEL, HIGHEST_LEVEL + 1)]
-        return Cells(*stream.leaf_octree(shares.ones, rows, earlier_cells))
+        return Cells(*stream.leaf_octree(shares.ones, rows, [earlier.at(level) for level in EVERY_LEVEL]))
     return walk(lambda contexts, bits: stream.bits(shares.ones[contexts], bits), rows, earlier, wanted)[0]
 
 

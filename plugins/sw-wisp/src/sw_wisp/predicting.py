@@ -17,6 +17,7 @@ from sw_codecs.bits.packing import ByteReader
 from sw_codecs.context.integer_mlp import IntegerMlp
 from sw_codecs.entropy.exact_tables import step_multipliers
 from sw_wisp.eight_bits import EXACT_EXPONENT, EightBitLayer, pack_layers, unpack_layers
+from sw_wisp.fast.running_means import pyramid_of
 from sw_wisp.nested import UNIT
 from sw_wisp.numbers import BLOCKS, LATENTS, NUMBERS
 from sw_wisp.packets import Prediction, State
@@ -55,7 +56,6 @@ class PyramidContext:
     _networks: list[IntegerMlp] = field(init=False, repr=False)
     _pyramid: Pyramid = field(init=False, repr=False)
     _features: torch.Tensor = field(init=False, repr=False)
-    _room: torch.Tensor = field(init=False, repr=False)
 
     kind = "pyramid"
     waves = WAVES
@@ -67,8 +67,7 @@ class PyramidContext:
 
     def start(self) -> None:
         """Forget all splats."""
-        self._room = torch.empty(0, FEATURES, dtype=torch.int64)
-        self._pyramid = Pyramid(torch.from_numpy(self.prior))
+        self._pyramid = pyramid_of(torch.from_numpy(self.prior))
 
     def predict(self, block: slice, rows: np.ndarray, state: State) -> Prediction:
         """Distributions of the columns `block` of splats `rows`, all blocks before it known."""
@@ -77,10 +76,7 @@ class PyramidContext:
             self._pyramid.announce(*(torch.from_numpy(each[known:]) for each in (state.levels, state.cells.codes)))
         number, width = BLOCKS.index(block), block.stop - block.start
         if number == 0 or block == VIEW:
-            if len(self._room) < len(rows):  # half of all rows are in the last part
-                self._room = torch.empty(max(len(rows), (len(state.levels) + 1) // 2), FEATURES, dtype=torch.int64)
-            # B and C follow A with the same rows.
-            self._features = self._pyramid.features(torch.from_numpy(rows), out=self._room)
+            self._features = self._pyramid.features(torch.from_numpy(rows))  # B and C follow A with the same rows
         further = torch.from_numpy(state.units(rows, slice(0, block.start))) if number else None
         out = self._networks[number](self._features, further).numpy()
         mean = self._features[:, block].numpy() + out[:, :width]

@@ -12,14 +12,12 @@ Opacity, shape, size and colour have one number n, latents another, since they b
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from sw_gaussians.morton import interleave
 from torch import Tensor
 
-from sw_wisp.fast import running_means
-from sw_wisp.fast.exact_native import EXACT
 from sw_wisp.nested import UNIT
 from sw_wisp.numbers import HIGHEST_LEVEL, LATENTS, NUMBERS
 from sw_wisp.packets import REFINED, VALUE_LIMIT, default_order, waves
@@ -55,8 +53,6 @@ class Pyramid:
         self._known = [False, False]
         activity = torch.full((NUMBERS,), SIXTEENTH, device=device)
         self._prior = [torch.cat([prior[p], activity[p]]).double() for p in PARTS]
-        self._room = torch.empty(0, 2 * NUMBERS, dtype=torch.float64)
-        self._has_kernels = device.type == "cpu" and EXACT.try_load()
 
     def __len__(self) -> int:
         return len(self._levels)
@@ -112,23 +108,14 @@ class Pyramid:
 
     def add(self, rows: Tensor, part: slice, values: Tensor, indices: Tensor) -> None:
         """Take in the columns `part`, BASE or VIEW, of splats that became known: values and indices [n,c]."""
-        number = PARTS.index(part)
-        self._known[number] = True
-        if self._has_kernels:
-            running_means.add(rows, self._leaf, self._parent, values, indices, 0, self._own[number], self._sums[number])
-            return
         activity = indices.abs().clamp_max(MOST_ACTIVE) * SIXTEENTH
         table = torch.cat([bounded(values), activity.double(), activity.new_ones(len(rows), 1).double()], dim=1)
-        self._spread(rows, number, slice(None), table)
+        self._known[PARTS.index(part)] = True
+        self._spread(rows, PARTS.index(part), slice(None), table)
 
     def refine(self, rows: Tensor, columns: slice, before: Tensor, after: Tensor) -> None:
         """Values [n,c] of columns of BASE became finer; activities stay what they were."""
-        change = bounded(after) - bounded(before)
-        if self._has_kernels:
-            first = columns.start
-            running_means.add(rows, self._leaf, self._parent, change, None, first, self._own[0], self._sums[0])
-            return
-        self._spread(rows, 0, columns, change)
+        self._spread(rows, 0, columns, bounded(after) - bounded(before))
 
     def _spread(self, rows: Tensor, part: int, columns: slice, table: Tensor) -> None:
         if not len(rows):
@@ -140,19 +127,8 @@ class Pyramid:
             cells.index_add_(0, self._parent[own], cells[own].clone())
         self._sums[part][:, columns] += cells
 
-    def features(self, rows: Tensor, out: Tensor | None = None) -> Tensor:
-        """Features int64 [n,69] of some splats, 12 fractional bits.
-
-        out     int64 [n or more, 69] on the CPU that may take them: fresh memory costs twice what is computed in it
-        """
-        if self._has_kernels and len(rows):
-            if len(self._room) < len(self._keys):
-                self._room = torch.empty(len(self._keys), 2 * NUMBERS, dtype=torch.float64)
-            found = rows.new_empty(len(rows), FEATURES) if out is None else out[: len(rows)]
-            cells = (self._levels, self._leaf, self._parent, self._depth, self._starts)
-            sums = [sums if known else None for sums, known in zip(self._sums, self._known, strict=True)]
-            running_means.features(rows, cells, self._prior, sums, self._room, found)
-            return found
+    def features(self, rows: Tensor) -> Tensor:
+        """Features int64 [n,69] of some splats, 12 fractional bits."""
         levels, leaf = self._levels[rows], self._leaf[rows]
         depth = self._depth[leaf]
         ways = [leaf]
@@ -225,6 +201,7 @@ def walked_features(
     order: Sequence[tuple[int, str]] | None = None,
     planes: int = 0,
     multipliers: Tensor | None = None,
+    make: Callable[[Tensor], Pyramid] = Pyramid,
 ) -> tuple[Tensor, Tensor]:
     """Features of all splats as a file would have them: for latents and for all before them, each [N,69] float32.
 
@@ -235,7 +212,7 @@ def walked_features(
     order       (subset, kind) of each packet; None: `default_order`
     planes      refinements, and `multipliers` [N,22] steps in base steps; None: 1
 
-    First the features of opacity, shape, size and colour, then those of latents. All tensors on one device.
+    Those of latents come second. All tensors on one device. `make`: the class, or `running_means.pyramid_of`.
     """
     codes = interleave(cells)
     by_place = torch.argsort((codes << 3 * (HIGHEST_LEVEL - levels)) * 32 + levels, stable=True)
@@ -244,7 +221,7 @@ def walked_features(
     units = (values.double() * UNIT).round()
     steps = torch.full_like(units, UNIT) if multipliers is None else (multipliers.double() * UNIT).round()
     indices = indices.double().round()
-    pyramid = Pyramid(prior)
+    pyramid = make(prior)
     found = [torch.zeros(len(levels), FEATURES, device=values.device) for _ in range(2)]
     left: dict[int, int] = {}
     number = torch.empty_like(levels)  # of each row in the pyramid

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from sw_wisp.context import ContextNetworks, Draw, Forecast
+from sw_wisp.fast.running_means import pyramid_of
 from sw_wisp.nested import UNIT, index_bits
 from sw_wisp.numbers import BLOCKS, HIGHEST_LEVEL, LOWEST_LEVEL, NUMBERS
 from sw_wisp.predicting import STEPS_OF
@@ -270,7 +271,7 @@ class PyramidRate(nn.Module):
         return dict(zip(self.CONTEXT, self._features(splats, drawn / self.base_steps, indices), strict=True))
 
     def _features(self, splats: Placed, units: Tensor, indices: Tensor) -> tuple[Tensor, Tensor]:
-        return walked_features(self.networks.prior, splats.levels, splats.cells, units, indices)
+        return walked_features(self.networks.prior, splats.levels, splats.cells, units, indices, make=pyramid_of)
 
     def predict(self, context: tuple[Tensor, ...], values: Tensor, draw: Draw) -> tuple[Forecast, Tensor]:
         return self._predict(context, values, draw, self.adapts)

@@ -12,13 +12,14 @@ from wisp_scenes import made_up
 from splatwizard_core.api import BitstreamError, ContainerReader, ContainerWriter
 from sw_codecs.exact_native import EXACT as CODECS
 from sw_codecs.fast import exact_face as codecs_face
-from sw_wisp import file, nested, octree, pyramid
-from sw_wisp.fast import exact_face, streams
+from sw_wisp import file, nested, octree
+from sw_wisp.fast import exact_face, running_means, streams
 from sw_wisp.fast.exact_native import EXACT
+from sw_wisp.fast.running_means import pyramid_of
 from sw_wisp.fast.streams import FastReader
 from sw_wisp.nested import Reader, Writer
 from sw_wisp.octree_contexts import Shares
-from sw_wisp.pyramid import BASE, REFINED, VIEW, Pyramid
+from sw_wisp.pyramid import BASE, REFINED, VIEW
 
 MODULES = (CODECS, EXACT)
 pytestmark = pytest.mark.skipif(
@@ -38,7 +39,7 @@ def plain(monkeypatch):
 
     def call(work):
         with monkeypatch.context() as patch:
-            for module in (streams, pyramid):
+            for module in (streams, running_means):
                 patch.setattr(module, "EXACT", SimpleNamespace(try_load=lambda: False))
             return work()
 
@@ -145,11 +146,11 @@ def test_running_means_and_features_are_the_same_integers(plain):
     values, indices = (torch.from_numpy(rng.integers(-(1 << 21), 1 << 21, (700, 22))) for _ in range(2))
 
     def walk() -> torch.Tensor:
-        means, rows, found = Pyramid(torch.arange(22) * 160), torch.arange(700), []
+        means, rows, found = pyramid_of(torch.arange(22) * 160), torch.arange(700), []
         means.announce(levels[:400], codes[:400])
-        found.append(means.features(rows[:400]))
+        found.append(means.features(rows[:400]).clone())
         means.add(rows[:400:2], BASE, values[:400:2, BASE], indices[:400:2, BASE])
-        found.append(means.features(rows[1:400:2]))
+        found.append(means.features(rows[1:400:2]).clone())
         means.announce(levels[400:], codes[400:])
         means.add(rows[5:600:3], VIEW, values[5:600:3, VIEW], indices[5:600:3, VIEW])
         means.refine(rows[:400:2], REFINED, values[:400:2, REFINED], values[1:400:2, REFINED])
