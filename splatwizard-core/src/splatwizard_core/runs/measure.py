@@ -12,6 +12,7 @@ import torch
 
 from splatwizard_core.base.machine import describe_machine
 from splatwizard_core.base.memory import MemoryMeter, synchronize
+from splatwizard_core.coding.cuts import WHOLE, Prefix
 from splatwizard_core.evaluation import evaluate as quality
 from splatwizard_core.evaluation.metrics import MetricSetup, chosen_metrics
 from splatwizard_core.evaluation.speed import SpeedBlock, SpeedReport, measure_speed
@@ -197,7 +198,7 @@ def _flags(
     return [name for name, holds in told.items() if holds]
 
 
-def opener(path: Path, session: Session) -> Callable[[], Opened]:
+def opener(path: Path, session: Session, prefix: Prefix = WHOLE) -> Callable[[], Opened]:
     """Return a function that opens the model of a .swz, .ply or other file of Gaussians on the session's device."""
     encoded = session.plugins.importers.of_suffix(path) is None
 
@@ -206,11 +207,11 @@ def opener(path: Path, session: Session) -> Callable[[], Opened]:
             gaussians = read_gaussians(path, session.plugins)
             raster = gaussians.origin.get("raster", {})
             return Opened(gaussians.to(session.device).eval().requires_grad_(False), raster)
-        model, reader = open_model(path, session.plugins, session.device)
+        model, reader = open_model(path, session.plugins, session.device, prefix=prefix)
         return Opened(model, reader.raster, reader.made_on is not None, reader.static)
 
     if encoded:
-        import_method(path, session.plugins)  # code is not memory of the model
+        import_method(path, session.plugins, prefix)  # code is not memory of the model
     return open_file
 
 
