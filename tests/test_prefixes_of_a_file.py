@@ -77,6 +77,24 @@ def test_what_ends_at_no_cut_is_truncated_and_partial_takes_what_is_whole(capsys
     assert told(capsys, "decode", broken, "--repeats", 0)["digest"] == whole["digest"]
 
 
+def test_eval_measures_each_prefix_as_the_file_that_ends_there(capsys, tmp_path):
+    options = ("--scene", "demo:tiny", "--no-speed", "--quiet", "--metrics", "psnr")
+    found = told(capsys, "eval", PACKETS, *options, "--prefixes")
+    cuts = told(capsys, "info", PACKETS)["cuts"]
+    assert [(each["packets"], each["bytes"]) for each in found["prefixes"]] == [
+        (c["packets"], c["bytes"]) for c in cuts
+    ]
+    assert found["prefixes"][-1]["metrics"] == {"psnr": found["metrics"]["psnr"]["mean"]}
+    assert found["prefixes"][-1]["counts"] == found["counts"]
+    short = tmp_path / "short.swz"
+    short.write_bytes(PACKETS.read_bytes()[: cuts[1]["bytes"]])
+    alone = told(capsys, "eval", short, *options, "--prefixes")
+    assert alone["prefixes"] == found["prefixes"][:2]
+    assert alone["metrics"]["psnr"]["mean"] == found["prefixes"][1]["metrics"]["psnr"]
+    plain = told(capsys, "eval", GOLDEN / "3dgs_r3_v1.swz", *options, "--prefixes")
+    assert plain["prefixes"] == told(capsys, "eval", PACKETS, *options)["prefixes"] == []
+
+
 def test_a_file_without_cuts_is_not_cut(capsys, tmp_path):
     plain, out = GOLDEN / "3dgs_r3_v1.swz", tmp_path / "x.swz"
     assert "declares no cuts" in refused(capsys, "truncate", plain, "--packets", 1, "--out", out)

@@ -9,7 +9,7 @@ import click
 from splatwizard_core.cli import options as shared
 from splatwizard_core.cli.paths import EXISTING, INPUT_FILE, OUTPUT_FILE, existing, output_file
 from splatwizard_core.cli.setup import Choices, open_session, takes_choices
-from splatwizard_core.cli.truncate import packets_option, partial_option, size_option
+from splatwizard_core.cli.truncate import part_options
 from splatwizard_core.plugins import load_plugins
 
 
@@ -67,7 +67,7 @@ def encode(source: Path, out: Path | None, no_psnr: bool, as_json: bool, chosen:
         "--repeats", type=click.IntRange(min=0), default=3, show_default=True, metavar="N",
         help="Timed decodes after the first one; their median is reported.",
     ),
-    packets_option, size_option("--bytes"), partial_option,
+    *part_options("--bytes"),
     shared.set_option, shared.device_option, shared.json_option, shared.debug_option,
 )  # fmt: skip
 @takes_choices

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import click
@@ -24,27 +24,21 @@ class Size(click.ParamType):  # type: ignore[type-arg]  # generic only in new re
         return int(float(found[1]) * {"": 1, "k": 1e3, "M": 1e6, "G": 1e9}[found[2]])
 
 
-packets_option = click.option(
-    "--packets",
-    type=click.IntRange(min=1),
-    metavar="P",
-    help="With cuts: the first P packets.  [default: all]",
-)
-partial_option = click.option(
-    "--partial", is_flag=True, help="With cuts: the packets that are whole, of a file that is not all there."
-)
-
-
-def size_option(name: str) -> Callable[[shared.F], shared.F]:
-    """Return the option for the most bytes of a part."""
-    return click.option(name, "size", type=Size(), metavar="SIZE",
-                        help="With cuts: the packets that fit, as into 500kB.  [default: all]")  # fmt: skip
+def part_options(size: str) -> Sequence[Callable[[shared.F], shared.F]]:
+    """Return the options for a part of a file with cuts, parameters packets, size and partial; `size` is called so."""
+    return (
+        click.option("--packets", type=click.IntRange(min=1), metavar="P",
+                     help="With cuts: the first P packets.  [default: all]"),
+        click.option(size, "size", type=Size(), metavar="SIZE",
+                     help="With cuts: the packets that fit, as into 500kB.  [default: all]"),
+        click.option("--partial", is_flag=True, help="With cuts: the packets that are whole, of a broken file."),
+    )  # fmt: skip
 
 
 @click.command(short_help="a shorter file of one with cuts")
 @click.argument("file", metavar="FILE.swz", type=INPUT_FILE)
 @shared.options(
-    packets_option, size_option("--size"), partial_option,
+    *part_options("--size"),
     click.option("--out", metavar="SHORT.swz", type=OUTPUT_FILE, required=True, help="The file to write."),
     shared.json_option, shared.debug_option,
 )  # fmt: skip
