@@ -104,6 +104,13 @@ ROWS = [
     Row("eval {grey.swz} --scene demo:tiny --set iterations=3", "of no use here"),
     # Devices.
     Row("run --scene demo:tiny --device cuda", "torch sees no CUDA device here; use --device cpu"),
+    Row("decode {grey.swz} --packets 0", "Invalid value for '--packets'"),
+    Row("decode {grey.swz} --packets 1", "it declares no cuts"),
+    Row("decode {grey.swz} --bytes much", "'much' is no size, such as 500kB"),
+    Row("truncate {grey.swz} --packets 1 --out {new}.swz", "it declares no cuts"),
+    Row("truncate {grey.swz} --out {new}.swz", "give --packets P, --size SIZE or --partial"),
+    Row("truncate {cut.swz} --partial --out {new}.swz", "truncated"),
+    Row("truncate {grey.swz} --packets 1 --out {folder}", "is a folder: give the name of a file in it"),
     Row("decode {grey.swz} --device cuda", "torch sees no CUDA device here"),
     Row("encode {grey.ply} --out {new}.swz --device cuda", "torch sees no CUDA device here"),
     # Configuration files.

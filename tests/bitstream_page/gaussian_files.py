@@ -25,6 +25,21 @@ def exact_mode(static: dict[str, Any], sections: dict[str, bytes]) -> dict[str, 
 
 
 def quantized(static: dict[str, Any], sections: dict[str, bytes]) -> dict[str, np.ndarray]:
+    if "packets" not in static:
+        return quantized_rows(static, sections)
+    check(sum(n for n, _ in static["packets"]) == static["num_gaussians"], "rows of the packets")
+    found: list[dict[str, np.ndarray]] = []
+    swell = 0.0
+    for number, (n, g) in enumerate(static["packets"], 1):
+        part = {name.partition("/")[2]: data for name, data in sections.items() if name.startswith(f"{number}/")}
+        if part:
+            found.append(quantized_rows({**static, "num_gaussians": n}, part))
+            swell = g
+    joined = {name: np.concatenate([part[name] for part in found]) for name in found[0]}
+    return {**joined, "log_scales": joined["log_scales"] + np.float32(swell)}
+
+
+def quantized_rows(static: dict[str, Any], sections: dict[str, bytes]) -> dict[str, np.ndarray]:
     n, active = static["num_gaussians"], static["active_sh_degree"]
     points = octree(sections["positions"])
     check(len(points) == n, "number of points")

@@ -29,3 +29,5 @@ def register_commands(registry: Registry) -> None:
         ("schedule", "schedule:schedule", "a method's plan as a table"),
     )):  # fmt: skip
         registry.add(name, f"splatwizard_core.cli.{target}", summary=summary, position=position)
+    registry.add("truncate", "splatwizard_core.cli.truncate:truncate", summary="a shorter file of one with cuts",
+                 position=3.5)  # fmt: skip

@@ -43,6 +43,7 @@ from splatwizard_core.cli.paths import existing_file as existing_file
 from splatwizard_core.cli.setup import Choices as Choices
 from splatwizard_core.cli.setup import open_session as open_session
 from splatwizard_core.cli.setup import takes_choices as takes_choices
+from splatwizard_core.coding.cuts import Prefix as Prefix
 from splatwizard_core.coding.limits import decoded_limit as decoded_limit
 from splatwizard_core.errors import DiskFullError as DiskFullError
 from splatwizard_core.errors import RunLockedError as RunLockedError

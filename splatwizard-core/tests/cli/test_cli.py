@@ -24,7 +24,7 @@ from splatwizard_core.runs import file_needs
 
 assert file_needs  # here, so that it does not keep the catalogue of a test that imports it first
 COMMANDS = (
-    "run", "train", "encode", "decode", "eval", "export", "info", "list-plugins", "schedule",
+    "run", "train", "encode", "decode", "truncate", "eval", "export", "info", "list-plugins", "schedule",
 )  # fmt: skip
 """Of the core."""
 

@@ -37,7 +37,7 @@ def small_file():
     return writer
 
 
-def rebuilt(header, payload=b"", *, raw=None, version=container.VERSION):
+def rebuilt(header, payload=b"", *, raw=None, version=1):
     """A file with a valid CRC around whatever header a stranger thinks up."""
     body = json.dumps(header).encode() if raw is None else raw
     return struct.pack("<4sHI", b"SPWZ", version, len(body)) + body + struct.pack("<I", zlib.crc32(body)) + payload

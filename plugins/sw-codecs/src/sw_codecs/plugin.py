@@ -119,7 +119,7 @@ def register_coders(registry: Registry[Any]) -> None:
                  summary="vectors as sums of codebook entries, indices Huffman coded or packed")  # fmt: skip
     registry.add("gaussians-exact", "sw_codecs.models.codecs:Exact", codes="gaussians", stores="float32",
                  summary="whole Gaussian models, float32 as trained")  # fmt: skip
-    registry.add("gaussians-quantized", "sw_codecs.models.codecs:Quantized", codes="gaussians",
+    registry.add("gaussians-quantized", "sw_codecs.models.codecs:Quantized", codes="gaussians", prefixes="prefixes=8",
                  summary="whole Gaussian models on a lattice, octree positions, range coded")  # fmt: skip
     registry.add("gaussians-ply", "sw_codecs.models.codecs:Ply", codes="gaussians", stores="float32",
                  summary="whole Gaussian models, the .ply of 3DGS bit for bit")  # fmt: skip

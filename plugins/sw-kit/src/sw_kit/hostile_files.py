@@ -53,10 +53,23 @@ class Parts:
             at += len(content)
         return rows
 
+    def true_cuts(self) -> Any:
+        """The cuts of the header with the lengths that the sections have now; as they are where they make no sense."""
+        rows = self.header["cuts"]
+        try:
+            counts = [*(int(row[0]) for row in rows[:-1]), len(self.sections)]
+            ends = [sum(len(content) for _, content in self.sections[:n]) for n in counts]
+            return [[n, end, row[2]] for n, end, row in zip(counts, ends, rows, strict=True)]
+        except (TypeError, ValueError, LookupError, OverflowError):
+            return rows
+
     def join(self, table: list[Any] | None = None, raw: Callable[[bytes], bytes] = bytes) -> bytes:
         """The file with right checksums. table: instead of the true section table; raw: changes the header's bytes."""
-        header = raw(json.dumps({**self.header, "sections": self.table() if table is None else table}).encode())
-        prefix = struct.pack("<4sHI", b"SPWZ", 1, len(header))
+        told = {**self.header, "sections": self.table() if table is None else table}
+        if "cuts" in told and table is None:
+            told["cuts"] = self.true_cuts()
+        header = raw(json.dumps(told).encode())
+        prefix = struct.pack("<4sHI", b"SPWZ", 2 if "cuts" in self.header else 1, len(header))
         return b"".join([prefix, header, struct.pack("<I", zlib.crc32(header)), *(s for _, s in self.sections)])
 
 
@@ -111,6 +124,28 @@ class Mutator:
             return self.pick((old + 1, old - 1, old * 2, -old, old * 1000, old / 1000, float(old)))
         return copy.deepcopy(self.pick(VALUES))
 
+    def cuts(self, parts: Parts) -> bytes:
+        """A file whose cuts may be wrong, and that ends at one of them or anywhere."""
+        table = parts.table()
+        rows = [[n + 1, at + size, None] for n, (_, at, size, _) in enumerate(table) if size and self.below(2)]
+        rows = parts.true_cuts() if "cuts" in parts.header else rows
+        for _ in range(self.pick((0, 1, 1, 2))):
+            what, row = self.below(5), self.pick(rows) if rows else []
+            if what == 0:
+                rows.insert(self.below(len(rows) + 1), self.value(row))
+            elif what == 1:
+                rows.insert(self.below(len(rows) + 1), copy.deepcopy(row))
+            elif what == 2 and rows:
+                del rows[self.below(len(rows))]
+            elif what == 3:
+                rows += [[n, n, None] for n in range(self.pick((1, 5000)))]
+            elif isinstance(row, list) and len(row) == 3:
+                row[self.below(3)] = self.value(self.pick(row))
+        data = Parts({**parts.header, "cuts": rows}, parts.sections).join(table)
+        start = len(data) - sum(len(content) for _, content in parts.sections)
+        ends = [start + at + size for _, at, size, _ in table] or [start]
+        return data[: self.pick(ends) if self.below(4) else self.below(len(data) + 1)]
+
     def entries(self, mapping: dict[str, Any]) -> None:
         """Change, remove or add an entry of a JSON object."""
         what = self.below(6)
@@ -133,6 +168,8 @@ class Mutator:
             return self.bytes_(data, self.pick(seeds)), kind
         parts, other = Parts.of(data), Parts.of(self.pick(seeds))
         sections = parts.sections
+        if kind == "cuts":
+            return self.cuts(parts), kind
         if kind == "header bytes":
             return parts.join(raw=lambda raw: self.bytes_(raw)), kind
         if kind == "header values":
@@ -179,7 +216,7 @@ class Mutator:
             sections[i] = (sections[i][0], self.pick(other.sections)[1])
 
 
-KINDS = ("damage", "header bytes", "header values", "header values", "table", "sections", *("content",) * 5)
+KINDS = ("damage", "header bytes", "header values", "header values", "table", "sections", "cuts", *("content",) * 5)
 
 
 def varint(value: int) -> bytes:

@@ -18,6 +18,7 @@ from sw_report.blocks import Cell, Table
 from sw_report.configurations import seed_of
 from sw_report.distortion import bd_tables, with_values
 from sw_report.dtu_table import dtu_table
+from sw_report.prefixes import prefixes_table, with_prefixes
 from sw_report.results_tables import bd_table, means_table, metric_names, runs_table
 from sw_report.runs import Collection, Run, machine
 
@@ -43,7 +44,10 @@ def survey_row(run: Run, lpips: str | None = numbers.FIELD_LPIPS) -> list[str]:
 
 
 def to_csv(runs: Sequence[Run]) -> str:
-    """One table of all runs: what tells them apart, the survey's columns, the number of seeds and their deviations."""
+    """One table of all runs: what tells them apart, the survey's columns, the number of seeds and their deviations.
+
+    The prefixes of a file with cuts follow its row, but for the whole file, with their packets: `r3 packets 1`.
+    """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     deviations = [f"{name} deviation" for name in SURVEY_COLUMNS[1:4]]
@@ -55,6 +59,13 @@ def to_csv(runs: Sequence[Run]) -> str:
         spread = [None if name is None else run.deviation(name) for name in ("psnr", "ssim", lpips)]
         told = ["" if value is None else f"{value:.5f}" for value in spread]
         writer.writerow([*map(_cell, where), *survey_row(run, lpips), lpips or "", str(len(run.seeds)), *told])
+        for prefix in facts.prefixes[:-1]:
+            means = [(prefix.metrics.get(name or ""), d) for name, d in (("psnr", 4), ("ssim", 5), (lpips, 5))]
+            scores = ["" if mean is None else f"{mean:.{digits}f}" for mean, digits in means]
+            part = _cell(f"{facts.rate or facts.preset or ''} packets {prefix.packets}".strip())
+            number = prefix.counts.get("num_gaussians", "")
+            rest = [lpips if lpips in prefix.metrics else "", "1", "", "", ""]
+            writer.writerow([*map(_cell, where), part, *scores, str(prefix.bytes), str(number), *rest])
     return text.getvalue()
 
 
@@ -107,6 +118,7 @@ def run_dict(run: Run) -> dict[str, Any]:
         "seeds": [seed_of(each) for each in run.seeds],
         "bytes": round(run.size),
         "sections": facts.file.sections,
+        "prefixes": [prefix.model_dump() for prefix in facts.prefixes],
         "counts": {unit: round(n) for unit, n in run.counts.items()},
         "steps": facts.train.steps,
         "pretraining_steps": {name: scene.steps for name, scene in (facts.train.pretraining or {}).items()},
@@ -135,6 +147,7 @@ def tables_of(collection: Collection, *, anchor: str | None, partial: bool, pare
     found = []
     for place in dict.fromkeys(run.place for run in runs):
         found.append((f"{place[0]}, protocol {place[1]}", runs_table([run for run in runs if run.place == place])))
+    found += [(prefixes_table(run).title, prefixes_table(run)) for run in with_prefixes(runs)]
     for means in dataset_tables(runs, partial=partial):
         found.append((f"{means.title}, protocol {', '.join(means.protocols)}", means_table(means)))
     if (dtu := dtu_table(runs)) is not None:

@@ -17,6 +17,7 @@ from sw_report.charts import STYLES
 from sw_report.distortion import drawn_metrics
 from sw_report.method_styles import styles_of
 from sw_report.plots import counts_anchors
+from sw_report.prefixes import prefix_metrics, with_prefixes
 from sw_report.rd_file import themes
 from sw_report.runs import Run
 
@@ -50,6 +51,8 @@ class Panel:
 def write_figures(runs: Sequence[Run], folder: Path) -> list[Path]:
     """Write rd-<scene>.svg and .pdf for every scene and protocol, and rd-<data set> for means over scenes.
 
+    Files with cuts have prefixes-<scene>.svg and .pdf besides, one line each.
+
     Nothing is written where no metric has a value. Raises UserInputError without matplotlib; returns the files.
     """
     _check_matplotlib()
@@ -59,10 +62,14 @@ def write_figures(runs: Sequence[Run], folder: Path) -> list[Path]:
         drawings[_free(drawings, place[0])] = _of_scene([run for run in runs if run.place == place], styles)
     for table in dataset_tables(runs):
         drawings[_free(drawings, table.dataset)] = _of_means(table, runs, styles)
+    pieces: dict[str, list[Panel]] = {}
+    for place in dict.fromkeys(run.place for run in with_prefixes(runs)):
+        pieces[_free(pieces, place[0])] = _of_prefixes([run for run in runs if run.place == place], styles)
     folder.mkdir(parents=True, exist_ok=True)
     return [
-        write_panels(panels, folder / f"rd-{name}.{form}")
-        for name, panels in drawings.items() if panels
+        write_panels(panels, folder / f"{kind}-{name}.{form}")
+        for kind, named in (("rd", drawings), ("prefixes", pieces))
+        for name, panels in named.items() if panels
         for form in FORMS
     ]  # fmt: skip
 
@@ -117,6 +124,18 @@ def _of_scene(runs: Sequence[Run], styles: dict[str, int]) -> list[Panel]:
                               any(map(counts_anchors, own))))  # fmt: skip
         panels.append(Panel(numbers.heading(metric), [line for line in lines if line.points]))
     return panels
+
+
+def _of_prefixes(runs: Sequence[Run], styles: dict[str, int]) -> list[Panel]:
+    shown = with_prefixes(runs)
+    return [
+        Panel(numbers.heading(metric), [
+            Line(run.label, points, styles[run.variant])
+            for run in shown
+            if (points := [(p.bytes / 1e6, p.metrics[metric], None) for p in run.facts.prefixes if metric in p.metrics])
+        ])
+        for metric in prefix_metrics(shown)
+    ]  # fmt: skip
 
 
 def _of_means(table: DatasetTable, runs: Sequence[Run], styles: dict[str, int]) -> list[Panel]:

@@ -36,6 +36,7 @@ from sw_report.pictures import (
     single_gallery,
     views_per_scene,
 )
+from sw_report.prefixes import HEADING, prefix_parts
 from sw_report.runs import Collection, Run
 from sw_report.truth import EVEN_VIEWS, SceneOpener, Truth
 
@@ -194,6 +195,8 @@ def _single_sections(run: Run, options: PageOptions) -> list[Section]:
     table = plots.single_sections_table(run)
     part = Part(table=table) if table is not None else Part(text="The record lists no sections of the file.")
     sections.append(Section("bytes", BYTES, [part], short=SHORT[BYTES]))
+    if parts := prefix_parts([run], styles_of([run])):
+        sections.append(Section("prefixes", HEADING, [replace(part, heading="") for part in parts], short="Prefixes"))
     sections.append(_training("training", "Training", [run], tables.breakdown_table(facts)))
     sections.append(Section("cost", "Time and memory", [Part(table=tables.cost_table(facts))]))
     if parts := geometry_parts(run, pictures=options.pictures):
@@ -280,6 +283,7 @@ def _answer(
     charts = plots.distortion_charts(runs, style_of)
     if charts is not None and len(runs) > 1:
         parts.append(Part("Rate and distortion", charts=charts))
+    parts += prefix_parts(runs, style_of)
     if options.pictures:
         if budget.spent:
             parts.append(Part(PICTURES, "Left out: the page holds as many pictures as it may."))

@@ -9,6 +9,7 @@ import click
 from splatwizard_core.cli import options as shared
 from splatwizard_core.cli.paths import EXISTING, INPUT_FILE, OUTPUT_FILE, existing, output_file
 from splatwizard_core.cli.setup import Choices, open_session, takes_choices
+from splatwizard_core.cli.truncate import part_options
 from splatwizard_core.plugins import load_plugins
 
 
@@ -66,18 +67,30 @@ def encode(source: Path, out: Path | None, no_psnr: bool, as_json: bool, chosen:
         "--repeats", type=click.IntRange(min=0), default=3, show_default=True, metavar="N",
         help="Timed decodes after the first one; their median is reported.",
     ),
+    *part_options("--bytes"),
     shared.set_option, shared.device_option, shared.json_option, shared.debug_option,
 )  # fmt: skip
 @takes_choices
-def decode(file: Path, out: Path | None, repeats: int, as_json: bool, chosen: Choices) -> None:
+def decode(
+    file: Path,
+    out: Path | None,
+    repeats: int,
+    packets: int | None,
+    size: int | None,
+    partial: bool,
+    as_json: bool,
+    chosen: Choices,
+) -> None:
     """Decode FILE.swz from nothing but itself; report time, counts and the digest of the model."""
+    from splatwizard_core.coding.cuts import Prefix
     from splatwizard_core.runs.decode import save_decoded, timed_decode
 
     plugins = load_plugins()
     session = open_session(chosen.resolve_without_method(), plugins)
-    model, facts = timed_decode(file, session, repeats=repeats)
+    model, facts = timed_decode(file, session, repeats=repeats, prefix=Prefix(packets, size, partial))
     if out is not None:
         save_decoded(model, facts, out, plugins)
     printed = facts.model_dump(mode="json") | ({} if out is None else {"out": str(out)})
-    told = f"{shared.counted(facts.counts)}, decoded in {facts.decode_s:.3f} s on {facts.device}"
+    part = f"{facts.packets} packets, {facts.bytes:,} bytes, " if facts.packets else ""
+    told = f"{part}{shared.counted(facts.counts)}, decoded in {facts.decode_s:.3f} s on {facts.device}"
     shared.print_facts(printed, as_json, f"{facts.method}: {told}\nmodel digest {facts.digest}")

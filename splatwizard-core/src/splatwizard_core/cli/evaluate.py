@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,10 @@ from splatwizard_core.plugins import load_plugins
         "--roundtrip", is_flag=True,
         help="Of a run directory: encode it, decode the file in a fresh process, measure that.",
     ),
+    click.option(
+        "--prefixes", is_flag=True,
+        help="Of a file with cuts: measure each prefix too, by --metrics, else PSNR and SSIM.",
+    ),
     click.option("--no-speed", is_flag=True, help="Leave out rendering speed and memory."),
     shared.repeats_option, shared.geometry_option,
     click.option("--quiet", is_flag=True, help="Do not warn of metrics that cannot be computed."),
@@ -45,6 +50,7 @@ def evaluate(
     metrics: str | None,
     renders: Path | None,
     roundtrip: bool,
+    prefixes: bool,
     no_speed: bool,
     repeats: int,
     geometry: bool,
@@ -61,7 +67,7 @@ def evaluate(
     """
     from splatwizard_core.runs.encode import encode_directory, finished_training
     from splatwizard_core.runs.fresh import decode_fresh
-    from splatwizard_core.runs.measure import Opened, measure, opener
+    from splatwizard_core.runs.measure import Opened, measure, measure_prefixes, opener
 
     plugins = load_plugins()
     names = None if metrics is None else [m.strip() for m in metrics.split(",") if m.strip()]
@@ -100,6 +106,9 @@ def evaluate(
             renders=renders,
         )
         size = None if measured.is_dir() else measured.stat().st_size
+        if prefixes and size is not None and session.plugins.importers.of_suffix(measured) is None:
+            rows = measure_prefixes(session, resolved, measured, names or ["psnr", "ssim"])
+            found = found.model_copy(update={"prefixes": rows})
     if digest not in (None, found.digest):
         raise SplatwizardError(f"{file}: two processes decode different models from the same file")
     facts = found.model_dump(mode="json", exclude={"asked"})
@@ -135,5 +144,12 @@ def _print(facts: dict[str, Any]) -> None:
         rows.append(["peak memory", f"{memory['peak_render_bytes'] / 1e6:,.0f} MB ({memory['kind']})"])
     name = Path(facts["file"]["path"]).name
     shared.print_table([], rows, title=f"{name} on {facts['scene']}, protocol {facts['protocol']['id']}")
+    if facts["prefixes"]:
+        names = list(facts["prefixes"][0]["metrics"])
+        cells = [
+            [f"{cut['packets']}", f"{cut['bytes']:,}", *(f"{cut['metrics'].get(n, math.nan):.4f}" for n in names)]
+            for cut in facts["prefixes"]
+        ]
+        shared.print_table(["packets", "bytes", *names], cells, right=2 + len(names))
     for name, reason in facts["unknown"].items():
         click.echo(f"{name.removeprefix('metrics.').removesuffix('.mean')}: {short_reason(reason)}")

@@ -129,6 +129,14 @@ def _print_file(facts: dict[str, Any]) -> None:
     click.echo(without_orders("\n".join(lines)))
     total = ["file", f"{facts['size']:,}", "100.0%"]
     shared.print_table(["section", "bytes", "share"], [*sections, [], total], right=2)
+    if facts["cuts"]:
+        rows = [
+            [f"{cut['packets']}", f"{cut['bytes']:,}", "-" if cut["psnr"] is None else f"{cut['psnr']:.2f}"]
+            for cut in facts["cuts"]
+        ]
+        shared.print_table(["packets", "bytes", "PSNR of the training views, dB"], rows, right=3)
+    if facts["packets"] < len(facts["cuts"]):
+        click.echo(f"the file ends after packet {facts['packets']} of {len(facts['cuts'])}")
     for reason in facts["missing"].values():
         click.echo(without_orders(reason))
 

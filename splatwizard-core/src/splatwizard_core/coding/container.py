@@ -3,7 +3,7 @@
 Layout, little-endian, byte by byte in docs/bitstream.md:
 
     4 bytes   magic "SPWZ"
-    u16       container version, 1
+    u16       container version: 1, or 2 if the header declares cuts
     u32       header length H
     H bytes   header, UTF-8 JSON
     u32       CRC-32 of the H header bytes
@@ -11,7 +11,8 @@ Layout, little-endian, byte by byte in docs/bitstream.md:
 
 The header holds `method`, `method_version`, `requires` (which distributions wrote it, see requirements.py), `raster`
 (what a renderer must do, such as {"antialias": false}), `static` (whatever the method wants to remember) and
-`sections`, a list of [name, offset, length, crc32] whose offsets count from the end of the header's CRC.
+`sections`, a list of [name, offset, length, crc32] whose offsets count from the end of the header's CRC; in version 2
+also `cuts` (see cuts.py), and the file may end at any of them.
 Source: specification of the codec library, container.
 """
 
@@ -24,6 +25,7 @@ import re
 import struct
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -33,12 +35,13 @@ import numpy.typing as npt
 from splatwizard_core.base.files import write_atomic
 from splatwizard_core.base.strict_json import dump_strict, load_strict
 from splatwizard_core.coding.array_section import pack_array, unpack_array
+from splatwizard_core.coding.cuts import WHOLE, Cut, Prefix, chosen_cut, parse_cuts
 from splatwizard_core.coding.limits import beyond_limit, decoded_limit
 from splatwizard_core.coding.requirements import Requirement, dump_requirements, parse_requirements
-from splatwizard_core.errors import BitstreamError, PluginError, SplatwizardError, no_file
+from splatwizard_core.errors import BitstreamError, PluginError, SplatwizardError, UserInputError, no_file
 
 MAGIC = b"SPWZ"
-VERSION = 1
+VERSION = 2
 MAX_HEADER = 1 << 19  # 512 KiB; anything longer belongs into a section
 MAX_SECTIONS = 4096
 NAME = re.compile(r"(?!header$)[A-Za-z0-9_][A-Za-z0-9_./-]{0,63}")  # "header" would clash in the breakdown
@@ -74,6 +77,7 @@ class ContainerWriter:
         self.requires: list[Requirement] = []
         self.required: list[tuple[str, str]] = []
         self._sections: dict[str, bytes] = {}
+        self._cuts: list[Cut] = []
 
     def add(self, name: str, data: bytes | bytearray | memoryview) -> None:
         """Append a section. Raises ValueError if the name is malformed or taken."""
@@ -88,6 +92,13 @@ class ContainerWriter:
     def add_array(self, name: str, array: npt.ArrayLike) -> None:
         """Append a section that states dtype and shape: bool, (u)int8-64 or float16-64, at most 8 axes."""
         self.add(name, pack_array(array))
+
+    def cut(self, psnr: float | None = None) -> None:
+        """Declare a cut after the sections added so far; a method with cuts declares the last one after all of them.
+
+        psnr    mean of the training views with what stands before the cut, dB, if it is known
+        """
+        self._cuts.append(Cut(len(self._sections), sum(map(len, self._sections.values())), psnr))
 
     def require(self, kind: str, name: str) -> None:
         """State that decoding needs a registered part that the method imports, such as ("entropy model", "columns").
@@ -116,11 +127,13 @@ class ContainerWriter:
             )
 
     def to_bytes(self) -> bytes:
-        """The whole file. Raises ValueError if `static` or `raster` hold something that is not JSON data."""
+        """The whole file. Raises ValueError if header values are no JSON data, or for cuts that make no sense."""
         table, offset = [], 0
         for name, data in self._sections.items():
             table.append([name, offset, len(data), zlib.crc32(data)])
             offset += len(data)
+        if self._cuts:
+            parse_cuts([list(cut) for cut in self._cuts], [0, *accumulate(map(len, self._sections.values()))])
         header = dump_strict(
             {
                 "method": self.method,
@@ -129,11 +142,12 @@ class ContainerWriter:
                 "raster": self.raster,
                 "static": self.static | ({WORLD_ORIGIN: list(self.world_origin)} if self.world_origin else {}),
                 "sections": table,
+                **({"cuts": [list(cut) for cut in self._cuts]} if self._cuts else {}),
             }
         )
         if len(header) > MAX_HEADER:
             raise ValueError(f"the header is {len(header):,} bytes, at most {MAX_HEADER:,}: use a section")
-        prefix = PREFIX.pack(MAGIC, VERSION, len(header))
+        prefix = PREFIX.pack(MAGIC, 2 if self._cuts else 1, len(header))
         return b"".join([prefix, header, CRC.pack(zlib.crc32(header)), *self._sections.values()])
 
     def write(self, path: str | os.PathLike[str]) -> int:
@@ -149,24 +163,26 @@ class ContainerWriter:
 class ContainerReader:
     """A parsed file; everything is checked when it is opened.
 
-    data    the whole file
+    data    the file, up to its end or to a declared cut
     name    what error messages call it
+    prefix  how much of a file with cuts is read; nothing behind that exists for the reader
 
     method, version     which method decodes it, and the version of its layout
     requires            which distributions wrote it; empty if the file does not say
     raster, static      header values, plain JSON data
     world_origin        where the origin of the coordinates lies in the world of the scene, unchecked; None: not told
-    sections            bytes of each section, in file order
-    size                bytes of the whole file = header_bytes + the sum over `sections`
+    sections            bytes of each section that is read, in file order
+    size                bytes that are read = header_bytes + the sum over `sections`
+    cuts, packets       the cuts that the file declares, and how many packets are read; of a file without cuts [] and 0
 
     Raises BitstreamError that names file, section and reason, in time and memory bounded by len(data).
     """
 
-    def __init__(self, data: bytes, name: str = "file") -> None:
-        self._read(io.BytesIO(data), len(data), name)
+    def __init__(self, data: bytes, name: str = "file", prefix: Prefix = WHOLE) -> None:
+        self._read(io.BytesIO(data), len(data), name, prefix)
 
     @classmethod
-    def open(cls, path: str | os.PathLike[str]) -> ContainerReader:
+    def open(cls, path: str | os.PathLike[str], prefix: Prefix = WHOLE) -> ContainerReader:
         """Read a file. Raises BitstreamError also if the path is not a readable file."""
         where = Path(path)
         reader = cls.__new__(cls)
@@ -174,12 +190,12 @@ class ContainerReader:
             if not where.is_file():
                 raise BitstreamError(f"{where}: {no_file(where)}")
             with where.open("rb") as file:
-                reader._read(file, os.fstat(file.fileno()).st_size, where.name)
+                reader._read(file, os.fstat(file.fileno()).st_size, where.name, prefix)
         except OSError as error:
             raise BitstreamError(f"{where}: cannot be read: {error.strerror}") from error
         return reader
 
-    def _read(self, file: BinaryIO, size: int, name: str) -> None:
+    def _read(self, file: BinaryIO, size: int, name: str, prefix: Prefix) -> None:
         self.name = name
         self.size = size
         header = self._header(file)
@@ -193,7 +209,7 @@ class ContainerReader:
         self.raster: dict[str, Any] = header["raster"]
         self.static: dict[str, Any] = header["static"]
         self.world_origin = self.static.pop(WORLD_ORIGIN, None)  # of the scene, no value of the method
-        self._payload = self._split(header["sections"], file)
+        self._payload = self._split(header, file, prefix)
         self.sections: dict[str, int] = {key: len(part) for key, part in self._payload.items()}
         self._unread = set(self._payload)
 
@@ -227,8 +243,11 @@ class ContainerReader:
             header = load_strict(raw)
         except ValueError as error:
             raise self._damage(f"header is not acceptable JSON: {error}", "header") from error
-        if not isinstance(header, dict) or set(header) - {"requires"} != set(HEADER):
-            raise self._damage(f"header must hold exactly {', '.join(HEADER)}, and it may hold requires", "header")
+        keys = set(HEADER) | ({"cuts"} if version == 2 else set())
+        if not isinstance(header, dict) or set(header) - {"requires"} != keys:
+            raise self._damage(
+                f"header must hold exactly {', '.join(sorted(keys))}, and it may hold requires", "header"
+            )
         for key, kind in HEADER.items():
             if type(header[key]) is not kind:
                 raise self._damage(f"header value '{key}' is not of type {kind.__name__}", "header")
@@ -247,30 +266,55 @@ class ContainerReader:
             f"reads: upgrade splatwizard-core with {command}"
         )
 
-    def _split(self, table: list[Any], file: BinaryIO) -> dict[str, bytes]:
-        if len(table) > MAX_SECTIONS:
-            raise self._damage(f"{len(table):,} sections, at most {MAX_SECTIONS} are allowed", "header")
+    def _split(self, header: dict[str, Any], file: BinaryIO, prefix: Prefix) -> dict[str, bytes]:
+        rows, available = self._rows(header["sections"]), self.size - file.tell()
+        self.cuts: list[Cut] = []
+        self.packets = 0
+        if "cuts" in header:
+            try:
+                self.cuts = parse_cuts(header["cuts"], [0, *accumulate(length for _, length, _ in rows)])
+            except ValueError as error:
+                raise self._damage(str(error), "header") from error
+        elif prefix.packets is not None or prefix.bytes is not None:
+            raise UserInputError(f"{self.name}: it declares no cuts, it is decoded whole or not at all")
+        if self.cuts and available <= self.cuts[-1].bytes:
+            try:
+                self.packets = chosen_cut(self.cuts, available, file.tell(), prefix, self.name)
+            except ValueError as error:
+                raise self._damage(str(error)) from error
+            sections, available, _ = self.cuts[self.packets - 1]
+            rows, self.size = rows[:sections], file.tell() + available
         payload: dict[str, bytes] = {}
-        position, available = 0, self.size - file.tell()
-        for row in table:
-            if not isinstance(row, list) or len(row) != 4 or not isinstance(row[0], str):
-                raise self._damage("a row of the section table is not [name, offset, length, crc32]", "header")
-            key, *numbers = row
-            if not NAME.fullmatch(key) or key in payload:
-                raise self._damage(f"section name {key[:64]!r} is malformed or appears twice", "header")
-            if any(type(n) is not int or n < 0 for n in numbers) or numbers[0] != position:
-                raise self._damage("offset, length or crc32 make no sense in the section table", key)
-            _, length, crc = numbers
-            part = file.read(min(length, available - position))  # never more than there is
+        for key, length, crc in rows:
+            part = file.read(min(length, available))  # never more than there is
             if len(part) != length:
                 raise self._damage(f"is {len(part):,} bytes, header says {length:,}: the file is truncated", key)
             if zlib.crc32(part) != crc:
                 raise self._damage("its CRC-32 does not match: the file is damaged", key)
             payload[key] = part
-            position += length
-        if position != available:
-            raise self._damage(f"{available - position:,} bytes follow the last section: the file is damaged")
+            available -= length
+        if available:
+            raise self._damage(f"{available:,} bytes follow the last section: the file is damaged")
         return payload
+
+    def _rows(self, table: list[Any]) -> list[tuple[str, int, int]]:
+        """Name, length and CRC-32 of each section."""
+        if len(table) > MAX_SECTIONS:
+            raise self._damage(f"{len(table):,} sections, at most {MAX_SECTIONS} are allowed", "header")
+        found: dict[str, tuple[str, int, int]] = {}
+        position = 0
+        for row in table:
+            if not isinstance(row, list) or len(row) != 4 or not isinstance(row[0], str):
+                raise self._damage("a row of the section table is not [name, offset, length, crc32]", "header")
+            key, *numbers = row
+            if not NAME.fullmatch(key) or key in found:
+                raise self._damage(f"section name {key[:64]!r} is malformed or appears twice", "header")
+            if any(type(n) is not int or n < 0 for n in numbers) or numbers[0] != position:
+                raise self._damage("offset, length or crc32 make no sense in the section table", key)
+            _, length, crc = numbers
+            found[key] = key, length, crc
+            position += length
+        return list(found.values())
 
     def _damage(self, reason: str, section: str | None = None) -> BitstreamError:
         where = self.name if section in (None, "header") else f"{self.name}: section '{section}'"
@@ -388,9 +432,9 @@ class ContainerReader:
         return value
 
     def summary(self) -> dict[str, Any]:
-        """Facts for `sw info`: identity, requirements, and bytes by section that sum to `size`."""
+        """Facts for `sw info`: identity, requirements, bytes by section that sum to `size`, and each cut."""
         return {
-            "container_version": VERSION,
+            "container_version": 2 if self.cuts else 1,
             "method": self.method,
             "method_version": self.version,
             "requires": {each.distribution: each.version for each in self.requires},
@@ -398,4 +442,9 @@ class ContainerReader:
             "static": self.static | ({WORLD_ORIGIN: self.world_origin} if self.world_origin is not None else {}),
             "size": self.size,
             "bytes": {"header": self.header_bytes, **self.sections},
+            "packets": self.packets,
+            "cuts": [
+                {"packets": number, "bytes": self.header_bytes + cut.bytes, "psnr": cut.psnr}
+                for number, cut in enumerate(self.cuts, 1)
+            ],
         }

@@ -12,6 +12,7 @@ from splatwizard_core.base.files import replacing
 from splatwizard_core.base.memory import MemoryMeter, synchronize
 from splatwizard_core.base.progress import track
 from splatwizard_core.coding.container import ContainerReader
+from splatwizard_core.coding.cuts import WHOLE, Prefix
 from splatwizard_core.errors import BitstreamError, PluginError, SplatwizardError, UserInputError
 from splatwizard_core.evaluation.speed import spread
 from splatwizard_core.gaussians.invalid_rows import leave_out_senseless
@@ -34,15 +35,16 @@ def read_gaussians(path: Path, plugins: PluginManager) -> GaussianModel:
 
 
 def open_model(
-    path: str | Path, plugins: PluginManager, device: torch.device, *, tell: bool = True
+    path: str | Path, plugins: PluginManager, device: torch.device, *, tell: bool = True, prefix: Prefix = WHOLE
 ) -> tuple[SplatModel, ContainerReader]:
     """Return the decoded model, ready to render on `device`, and the file it came from.
 
     tell    log what was left out of it
+    prefix  how much of a file with cuts is read
 
     Raises BitstreamError for a damaged file, PluginError if something that it needs is not installed.
     """
-    reader = ContainerReader.open(path)
+    reader = ContainerReader.open(path, prefix)
     model = decode_model(reader, plugins).to(device).eval().requires_grad_(False)
     if isinstance(model, GaussianModel):
         model = leave_out_senseless(model, reader.name, tell=tell)
@@ -77,9 +79,9 @@ def decode_model(reader: ContainerReader, plugins: PluginManager) -> SplatModel:
     return model
 
 
-def import_method(path: str | Path, plugins: PluginManager) -> None:
+def import_method(path: str | Path, plugins: PluginManager, prefix: Prefix = WHOLE) -> None:
     """Import the method that a file names, so that its code counts neither as memory nor as time of what follows."""
-    _method_of(ContainerReader.open(path), plugins)
+    _method_of(ContainerReader.open(path, prefix), plugins)
 
 
 def _method_of(reader: ContainerReader, plugins: PluginManager) -> type[Method]:
@@ -90,7 +92,9 @@ def _method_of(reader: ContainerReader, plugins: PluginManager) -> type[Method]:
     raise missing_plugin(reader, plugins, "method", name)
 
 
-def timed_decode(path: Path, session: Session, *, repeats: int = REPEATS) -> tuple[SplatModel, DecodingFacts]:
+def timed_decode(
+    path: Path, session: Session, *, repeats: int = REPEATS, prefix: Prefix = WHOLE
+) -> tuple[SplatModel, DecodingFacts]:
     """Decode once untimed and `repeats` times timed, after every native module was loaded or compiled, timed apart.
 
     Raises SplatwizardError if two decodes give different models.
@@ -100,11 +104,11 @@ def timed_decode(path: Path, session: Session, *, repeats: int = REPEATS) -> tup
     def once(*, tell: bool = False) -> tuple[SplatModel, ContainerReader, float]:
         synchronize(device)
         began = work_time()
-        model, reader = open_model(path, session.plugins, device, tell=tell)
+        model, reader = open_model(path, session.plugins, device, tell=tell, prefix=prefix)
         synchronize(device)
         return model, reader, work_time() - began
 
-    import_method(path, session.plugins)
+    import_method(path, session.plugins, prefix)
     meter = MemoryMeter(device)
     meter.start()
     with track(f"decode {path.name}", total=1 + repeats) as bar:
@@ -130,6 +134,7 @@ def timed_decode(path: Path, session: Session, *, repeats: int = REPEATS) -> tup
         digest=digest,
         counts=model.counts(),
         bytes=reader.size,
+        packets=reader.packets,
         sections={"header": reader.header_bytes, **reader.sections},
         raster=reader.raster,
         decode_s=statistics.median(runs) if runs else first,

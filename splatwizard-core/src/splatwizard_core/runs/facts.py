@@ -84,6 +84,7 @@ class DecodingFacts(StepFacts, DecodeFigures):
     digest: str
     counts: dict[str, int]
     bytes: int
+    packets: int = 0
     sections: dict[str, int]
     raster: dict[str, Any] = {}
     decode_s: float

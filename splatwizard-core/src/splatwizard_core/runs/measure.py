@@ -12,6 +12,8 @@ import torch
 
 from splatwizard_core.base.machine import describe_machine
 from splatwizard_core.base.memory import MemoryMeter, synchronize
+from splatwizard_core.coding.container import ContainerReader
+from splatwizard_core.coding.cuts import WHOLE, Prefix
 from splatwizard_core.evaluation import evaluate as quality
 from splatwizard_core.evaluation.metrics import MetricSetup, chosen_metrics
 from splatwizard_core.evaluation.speed import SpeedBlock, SpeedReport, measure_speed
@@ -22,7 +24,7 @@ from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.runs.config import ResolvedConfig
 from splatwizard_core.runs.decode import import_method, open_model, read_gaussians
 from splatwizard_core.runs.facts import Measurement, contention
-from splatwizard_core.runs.record import MemoryBlock, MetricBlock, ProtocolBlock
+from splatwizard_core.runs.record import MemoryBlock, MetricBlock, PrefixBlock, ProtocolBlock
 from splatwizard_core.runs.session import Session
 from splatwizard_core.runs.training_views import training_psnr
 from splatwizard_core.scene.camera import Camera
@@ -197,7 +199,7 @@ def _flags(
     return [name for name, holds in told.items() if holds]
 
 
-def opener(path: Path, session: Session) -> Callable[[], Opened]:
+def opener(path: Path, session: Session, prefix: Prefix = WHOLE) -> Callable[[], Opened]:
     """Return a function that opens the model of a .swz, .ply or other file of Gaussians on the session's device."""
     encoded = session.plugins.importers.of_suffix(path) is None
 
@@ -206,12 +208,25 @@ def opener(path: Path, session: Session) -> Callable[[], Opened]:
             gaussians = read_gaussians(path, session.plugins)
             raster = gaussians.origin.get("raster", {})
             return Opened(gaussians.to(session.device).eval().requires_grad_(False), raster)
-        model, reader = open_model(path, session.plugins, session.device)
+        model, reader = open_model(path, session.plugins, session.device, prefix=prefix)
         return Opened(model, reader.raster, reader.made_on is not None, reader.static)
 
     if encoded:
-        import_method(path, session.plugins)  # code is not memory of the model
+        import_method(path, session.plugins, prefix)  # code is not memory of the model
     return open_file
+
+
+def measure_prefixes(
+    session: Session, resolved: ResolvedConfig, path: Path, metrics: Sequence[str]
+) -> list[PrefixBlock]:
+    """Measure a file at each of its cuts that is there; nothing for a file without cuts."""
+    reader, found = ContainerReader.open(path), []
+    for cut in reader.summary()["cuts"][: reader.packets]:
+        part = opener(path, session, Prefix(cut["packets"]))
+        measured = measure(session, resolved, part, metrics=metrics, speed=False)
+        means = {name: metric.mean for name, metric in measured.metrics.items() if metric.mean is not None}
+        found.append(PrefixBlock(packets=cut["packets"], bytes=cut["bytes"], counts=measured.counts, metrics=means))
+    return found
 
 
 def open_subject(path: Path, session: Session, resolved: ResolvedConfig, scene: Scene | None = None) -> quality.Subject:

@@ -149,6 +149,15 @@ class PhaseBlock(Block):
     provided_by: list[Provided] = []
 
 
+class PrefixBlock(Block):
+    """A file with cuts, measured as if it ended at one of them."""
+
+    packets: int
+    bytes: int = Field(gt=0, description="up to the cut, header included")
+    counts: dict[str, int] = Field({}, description="as `counts` of the whole file")
+    metrics: dict[str, Score] = Field({}, description="means over the test views")
+
+
 class Quality(Block):
     """Measurements of a model on a scene, for `sw eval` and the record."""
 
@@ -171,6 +180,7 @@ class Quality(Block):
         None, description="by metric over the model its protocol, and what its value consists of"
     )
     training_psnr: Annotated[TrainingPsnrBlock | None, WhyNull("not measured")] = None
+    prefixes: list[PrefixBlock] = Field([], description="of a file with cuts each one, the whole file last")
     environment: dict[str, Any] = Field({}, description="packages, device, driver, clocks, threads, seed")
     contended: dict[str, float] = Field(
         {}, description="train, encode, decode, render: those that had to share the cores -> the share that they had"

@@ -67,7 +67,7 @@ def run(session: Session, request: RunRequest) -> tuple[schema.Record, Path]:
         def evaluate_it() -> Measurement:
             arguments = ["eval", str(encoded), "--config", str(directory / CONFIG), "--device", str(session.device)]
             arguments += ["--renders", str(directory / RENDERS), "--repeats", str(request.repeats), "--quiet", "--json"]
-            arguments += ["--geometry"] * request.geometry
+            arguments += ["--prefixes", *["--geometry"] * request.geometry]
             told = [*session.told, *(f"WARNING: {line}" for line in WARNED)]
             facts = Measurement.model_validate(run_fresh(arguments, told=told))
             return facts.model_copy(update={"asked": asked})

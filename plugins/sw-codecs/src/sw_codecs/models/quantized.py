@@ -2,7 +2,8 @@
 the settings name in their place.
 
 Rows are in Morton order of their grid cell. Gaussians that can never be drawn (opacity below 1/255, or a parameter that
-is not finite) are left out. The decoder needs integers and exact arithmetic only.
+is not finite) are left out. The decoder needs integers and exact arithmetic only. With `prefixes` the rows come in
+packets, the most significant Gaussians first, each coded like a file of its own: the file may end after any of them.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import torch
@@ -32,7 +33,7 @@ from sw_codecs.models.exchangeable import Exchangeable, entropy_model, position_
 from sw_codecs.models.position_grid import MAX_TOP, PositionGrid
 
 if TYPE_CHECKING:
-    from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager
+    from splatwizard_core.api import ContainerReader, ContainerWriter, EntropyModel, PluginManager, PositionCodec
     from sw_codecs.models.settings import QuantizedSettings
 
 log = logging.getLogger(__name__)
@@ -43,8 +44,16 @@ FAINTEST = math.log(1 / 255 / (1 - 1 / 255))
 SECTIONS = ("color", "opacity", "scales", "quats")
 """Sections of the first columns of the attribute matrix; SH bands 1 to 3 follow with one section each."""
 
+SMALLEST_PREFIX = 1 / 16
+"""The first of n packets holds this share of the Gaussians to the power 1 - 1/n, the first two to the power 1 - 2/n."""
+
 ROWS_AT_ONCE = 1 << 12
 """Rows that are dequantised together: intermediate doubles of all rows would outweigh the model several times."""
+
+
+Packet = tuple[Annotated[int, Field(ge=0, lt=2**32)], Annotated[float, Field(ge=0, le=10)]]
+"""Rows of a packet, and what is added to log scales while it is the last one: the Gaussians that are there swell over
+the gaps of those that are not."""
 
 
 class Layout(Params):
@@ -64,6 +73,7 @@ class Layout(Params):
     quat_step: float = Field(gt=0, le=1e3)
     sh_classes: int = Field(ge=1, le=MAX_CLASSES)
     primitive: Literal["surfel"] | None = None
+    packets: list[Packet] | None = Field(None, min_length=1, max_length=64)
 
     @property
     def scales(self) -> int:
@@ -97,47 +107,102 @@ class Layout(Params):
 
 
 def encode(model: GaussianModel, writer: ContainerWriter, settings: QuantizedSettings, plugins: PluginManager) -> None:
-    """Sections positions, color, opacity, scales, quats, sh1 .. sh<active degree>."""
+    """Sections positions, color, opacity, scales, quats, sh1 .. sh<active degree>; of packets 1/positions and so on."""
     positions = plugins.position_codecs.load(settings.positions)()
     layout, cells, symbols = lattice(model, settings, positions.sort)
+    packets, swell = significant_first(layout, symbols, settings.prefixes)
+    if packets:
+        told = list(zip(map(len, packets), swell, strict=True))
+        classes = suitable_classes(layout.num_gaussians // len(packets))
+        layout = layout.model_copy(update={"packets": told, "sh_classes": classes})
     writer.raster["sh_degree"] = layout.max_sh_degree
     writer.static.update(layout.model_dump(mode="json", exclude_none=True))
     settings.state(writer)
-    writer.add("positions", positions.encode(cells, layout.position_bits))
     columns = plugins.entropy_models.load(settings.entropy)()
-    for name, (start, stop) in layout.sections.items():
-        writer.add(name, columns.encode(symbols[:, start:stop], None))
-    for band, start, stop in _bands(layout):
-        classes, count = _classes(layout, band, symbols[:, layout.base_columns : start])
-        writer.add(f"sh{band}", encode_band(columns, symbols[:, start:stop], classes, count))
+    if not packets:
+        _encode_rows(layout, cells, symbols, "", writer, positions, columns)
+    for number, rows in enumerate(packets, 1):
+        _encode_rows(layout, cells[rows], symbols[rows], f"{number}/", writer, positions, columns)
+        writer.cut()
     writer.allow(layout.decoded_bytes, f"a model of {layout.num_gaussians:,} Gaussians")
 
 
-def decode(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
-    """The model on the lattice. Raises BitstreamError."""
-    layout = _layout(reader)
-    n = layout.num_gaussians
-    reader.allow(layout.decoded_bytes, f"a model of {n:,} Gaussians")
-    with reader.decoding("positions") as data:
-        cells = position_codec(reader, plugins, n).decode(data)
-        if cells.shape != (n, 3):
-            raise BitstreamError(f"holds {len(cells):,} points, header says {n:,}")
-        if n and not 0 <= int(cells.min()) <= int(cells.max()) < 1 << layout.position_bits:
-            raise BitstreamError(f"a point leaves the grid of {layout.position_bits} bits")
-    columns = entropy_model(reader, plugins)
-    symbols = np.empty((n, layout.base_columns + 3 * ((layout.active_sh_degree + 1) ** 2 - 1)), dtype=np.int32)
+def _encode_rows(
+    layout: Layout, cells: NDArray[np.int64], symbols: NDArray[np.int32], prefix: str, writer: ContainerWriter,
+    positions: PositionCodec, columns: EntropyModel,
+) -> None:  # fmt: skip
+    writer.add(f"{prefix}positions", positions.encode(cells, layout.position_bits))
     for name, (start, stop) in layout.sections.items():
-        with reader.decoding(name) as data:
-            symbols[:, start:stop] = decode_matrix(columns, data, n, stop - start)
+        writer.add(f"{prefix}{name}", columns.encode(symbols[:, start:stop], None))
     for band, start, stop in _bands(layout):
         classes, count = _classes(layout, band, symbols[:, layout.base_columns : start])
-        with reader.decoding(f"sh{band}") as data:
-            symbols[:, start:stop] = decode_band(columns, data, classes, count, stop - start)
-    model = reconstruct(layout, cells, symbols)
+        writer.add(f"{prefix}sh{band}", encode_band(columns, symbols[:, start:stop], classes, count))
+
+
+def significant_first(
+    layout: Layout, symbols: NDArray[np.int32], count: int
+) -> tuple[list[NDArray[np.int64]], list[float]]:
+    """Return the rows of each of `count` packets, ascending in each, and how much log scales grow after it.
+
+    The most significant come first: a Gaussian counts as much as it covers, opacity times the product of its two
+    largest scales. The packets up to a place hold a share of all rows that grows by the same factor each time. Scales
+    grow so that what is there covers as much as all will.
+    """
+    opacity = 1 / (1 + np.exp(-layout.opacity_step * symbols[:, 3].astype(np.float64)))
+    log_area = layout.scale_step * symbols[:, SCALES_FROM : SCALES_FROM + 2].astype(np.float64).sum(axis=1)
+    covered = opacity * np.exp(log_area - log_area.max(initial=-np.inf))
+    order = np.argsort(-covered, kind="stable")
+    shares = [SMALLEST_PREFIX ** (1 - number / count) for number in range(1, count + 1)]
+    ends = [round(share * len(order)) for share in shares]
+    packets = [np.sort(order[start:end]) for start, end in zip([0, *ends], ends, strict=False)]
+    sums = np.cumsum(covered[order])
+    return packets, [round(0.5 * math.log(sums[-1] / sums[end - 1]), 4) if end else 0.0 for end in ends]
+
+
+def decode(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
+    """The model on the lattice, of a file that ends at a cut that of its first packets. Raises BitstreamError."""
+    layout = _layout(reader)
+    packets = {"": layout.num_gaussians}
+    if layout.packets is not None:
+        packets = {f"{number}/": rows for number, (rows, _) in enumerate(layout.packets[: reader.packets], 1)}
+    n = sum(packets.values())
+    layout = layout.model_copy(update={"num_gaussians": n})
+    reader.allow(layout.decoded_bytes, f"a model of {n:,} Gaussians")
+    cells = np.empty((n, 3), dtype=np.int64)
+    symbols = np.empty((n, layout.base_columns + 3 * ((layout.active_sh_degree + 1) ** 2 - 1)), dtype=np.int32)
+    end = 0
+    for prefix, rows in packets.items():
+        start, end = end, end + rows
+        _decode_rows(layout, cells[start:end], symbols[start:end], prefix, reader, plugins)
+    swell = layout.packets[reader.packets - 1][1] if layout.packets is not None else 0.0
+    model = reconstruct(layout, cells, symbols, swell)
     for name, parameter in model.named_parameters():
         if not bool(torch.isfinite(parameter).all()):
             raise BitstreamError(f"{reader.name}: decoded '{name}' is not finite: the file is damaged or hostile")
     return model
+
+
+def _decode_rows(
+    layout: Layout, cells: NDArray[np.int64], symbols: NDArray[np.int32], prefix: str, reader: ContainerReader,
+    plugins: PluginManager,
+) -> None:  # fmt: skip
+    """Fill `cells` and `symbols` with the rows of one packet."""
+    n = len(cells)
+    with reader.decoding(f"{prefix}positions") as data:
+        found = position_codec(reader, plugins, n).decode(data)
+        if found.shape != (n, 3):
+            raise BitstreamError(f"holds {len(found):,} points, header says {n:,}")
+        if n and not 0 <= int(found.min()) <= int(found.max()) < 1 << layout.position_bits:
+            raise BitstreamError(f"a point leaves the grid of {layout.position_bits} bits")
+        cells[:] = found
+    columns = entropy_model(reader, plugins)
+    for name, (start, stop) in layout.sections.items():
+        with reader.decoding(f"{prefix}{name}") as data:
+            symbols[:, start:stop] = decode_matrix(columns, data, n, stop - start)
+    for band, start, stop in _bands(layout):
+        classes, count = _classes(layout, band, symbols[:, layout.base_columns : start])
+        with reader.decoding(f"{prefix}sh{band}") as data:
+            symbols[:, start:stop] = decode_band(columns, data, classes, count, stop - start)
 
 
 def lattice(
@@ -183,8 +248,10 @@ def lattice(
     return layout, cells[order], quantize(values, layout.steps)
 
 
-def reconstruct(layout: Layout, cells: NDArray[np.int64], symbols: NDArray[np.int32]) -> GaussianModel:
-    """The model that these integers stand for; what the decoder returns."""
+def reconstruct(
+    layout: Layout, cells: NDArray[np.int64], symbols: NDArray[np.int32], swell: float = 0.0
+) -> GaussianModel:
+    """The model that these integers stand for, with so much on its log scales; what the decoder returns."""
     n, grid, steps = layout.num_gaussians, layout.grid, layout.steps
     tails = {"means": (3,), "dc": (3,), "rest": ((layout.max_sh_degree + 1) ** 2 - 1, 3), "opacity_logits": (),
              "log_scales": (layout.scales,), "quats": (4,)}  # fmt: skip
@@ -197,6 +264,7 @@ def reconstruct(layout: Layout, cells: NDArray[np.int64], symbols: NDArray[np.in
         found["rest"][part, : values.rest.shape[1]] = values.rest
         for name in ("dc", "opacity_logits", "log_scales", "quats"):
             found[name][part] = getattr(values, name)
+    found["log_scales"] += np.float32(swell)
     found["dc"] = found["dc"][:, None, :]
     return gaussians_of(
         *(torch.from_numpy(array) for array in found.values()), active_sh_degree=layout.active_sh_degree
@@ -229,6 +297,9 @@ def _layout(reader: ContainerReader) -> Layout:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
         raise BitstreamError(f"{reader.name}: header value '{key}': {first['msg']}", section="header") from None
+    packets = layout.packets
+    if len(packets or ()) != len(reader.cuts) or (packets and sum(n for n, _ in packets) != layout.num_gaussians):
+        raise BitstreamError(f"{reader.name}: cuts, packets and their Gaussians do not fit together", section="header")
     if layout.active_sh_degree > layout.max_sh_degree:
         raise BitstreamError(f"{reader.name}: header activates more SH bands than there are", section="header")
     grid_fits = (

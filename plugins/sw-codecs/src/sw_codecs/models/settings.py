@@ -6,7 +6,7 @@ from sw_codecs.models.exchangeable import Exchangeable
 
 
 class QuantizedSettings(Exchangeable):
-    """Grid of the positions, quantiser steps of all else, and what codes both."""
+    """Grid of the positions, quantiser steps of all else, what codes both, and in how many packets."""
 
     position_bits: int = Field(18, ge=8, le=21, description="bits per axis of the position grid")
     dc_step: float = Field(
@@ -16,3 +16,9 @@ class QuantizedSettings(Exchangeable):
     opacity_step: float = Field(0.08, ge=1e-6, le=1e3, description="quantiser step of the opacity logits")
     scale_step: float = Field(0.03, ge=1e-6, le=1e3, description="quantiser step of the log scales (0.03: 3 % in size)")
     quat_step: float = Field(0.007, ge=1e-6, le=0.5, description="quantiser step of the unit quaternion's x, y, z")
+    prefixes: int = Field(
+        0,
+        ge=0,
+        le=64,
+        description="packets of Gaussians, the most significant first: the file can be cut after each; 0: one piece",
+    )

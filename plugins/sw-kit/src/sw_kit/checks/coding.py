@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import json
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from splatwizard_core.api import ContainerWriter
 from sw_codecs import testing
+from sw_kit.checks.prefixes import check_no_cuts, check_prefixes
 from sw_kit.checks.targets import make
 from sw_kit.finding import NotCheckedError
 from sw_kit.samples import some_gaussians
 
 if TYPE_CHECKING:
-    from splatwizard_core.api import PluginManager
+    from collections.abc import Callable
+
+    from splatwizard_core.api import GaussianCodec, PluginManager
     from splatwizard_core.tooling import Entry
 
 RNG_SEED = 5
@@ -39,7 +44,24 @@ def check_coder(entry: Entry, plugins: PluginManager) -> str:
         testing.check_array_coder(factory, array)
         return f"an array {list(array.shape)} {array.dtype} comes back bit for bit"
     decoded = testing.check_gaussian_codec(factory, plugins, some_gaussians())
-    return f"{decoded.num_rows} Gaussians come back, cut sections are refused"
+    exact = hold_cuts(entry, factory, plugins)
+    return f"{decoded.num_rows} Gaussians come back, cut sections are refused{exact and f'; {exact}'}"
+
+
+def hold_cuts(entry: Entry, factory: Callable[..., GaussianCodec], plugins: PluginManager) -> str:
+    """Hold a codec to the cuts that its entry declares, or to none; how many prefixes are exact."""
+
+    def file(**settings: Any) -> bytes:
+        writer = ContainerWriter("check", 0)
+        factory(plugins, **settings).encode(some_gaussians(), writer)
+        return writer.to_bytes()
+
+    check_no_cuts(file(), entry)
+    if "prefixes" not in entry.declared:
+        return ""
+    key, _, value = str(entry.declared["prefixes"]).partition("=")
+    data = file(**({key: json.loads(value)} if key else {}))
+    return check_prefixes(data, lambda reader: factory(plugins).decode(reader))
 
 
 def _array_for(factory: Any, rng: np.random.Generator) -> np.ndarray:

@@ -50,6 +50,10 @@ MODULES: Rule = (
     '"module:attribute" of a NativeModule, or a list of them',
 )
 DIRECTION: Rule = (lambda value: value in ("higher", "lower"), '"higher" or "lower"')
+SETTING: Rule = (
+    lambda value: isinstance(value, str) and (value == "" or bool(re.fullmatch(r"[\w.]+=\S+", value))),
+    'such as "prefixes=8", the setting with which a file has cuts, or "" (always)',
+)
 OVER: Rule = (lambda value: value in ("image", "model"), '"image" or "model"')
 CODES: Rule = (lambda value: value in SORTS, f"one of {', '.join(SORTS)}")
 ANY: Rule = (lambda value: True, "")
@@ -62,9 +66,10 @@ METRIC: dict[str, Rule] = {
 FIELDS: Mapping[str, Mapping[str, Rule]] = {
     "method": {
         "presets": NAMES, "rates": NAMES, "bd_anchor": COUNT, "default": FLAG, "published": FIGURES, "title": TEXT,
+        "prefixes": SETTING,
     },
     "metric": METRIC,
-    "coder": {"codes": CODES, "available": WHERE, "stores": TEXT},
+    "coder": {"codes": CODES, "available": WHERE, "stores": TEXT, "prefixes": SETTING},
     "exporter": {"suffix": SUFFIX},
     "importer": {"suffix": SUFFIXED},
     "command": {"position": NUMBER, "completes": FLAG},

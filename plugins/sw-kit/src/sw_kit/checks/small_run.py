@@ -18,9 +18,11 @@ import torch
 from splatwizard_core.api import ContainerWriter, Method, Params
 from splatwizard_core.tooling import Choices, RunRequest, Session, directory_lock, open_model, run, train_in
 from sw_kit.checks.interruptions import stops_of
+from sw_kit.checks.prefixes import check_no_cuts, check_prefixes
 from sw_kit.checks.targets import make
 from sw_kit.finding import BrokenContractError, hold
 from sw_kit.samples import TINY
+from sw_kit.short_training import file_of
 
 if TYPE_CHECKING:
     from splatwizard_core.api import PluginManager
@@ -63,8 +65,15 @@ def check_small_run(entry: Entry, plugins: PluginManager, settings: Sequence[str
                 "the file decodes to another model here than in a fresh process",
                 "decode() must be a function of the file: no random numbers, no state",
             )
+            check_no_cuts(file.read_bytes(), entry)
+            prefixes = ""
+            if "prefixes" in entry.declared:
+                more = [*settings, *filter(None, [entry.declared["prefixes"]])]
+                progressive = small_configuration(entry, plugins, more)
+                data = file_of(entry.load()(plugins, progressive.config), model)
+                prefixes = f"; {check_prefixes(data, lambda reader: entry.load()(plugins, None).decode(reader))}"
             hostile = _check_hostile(child)
-    return f"{steps} steps, {record.file.bytes:,} bytes, {psnr:.1f} dB; {resumed}; {hostile}"
+    return f"{steps} steps, {record.file.bytes:,} bytes, {psnr:.1f} dB; {resumed}{prefixes}; {hostile}"
 
 
 def small_configuration(

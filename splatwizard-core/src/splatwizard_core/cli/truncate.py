@@ -1,0 +1,64 @@
+"""`sw truncate`: a file that declares cuts, ended at one of them; and how commands ask for a part of such a file."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import click
+
+from splatwizard_core.cli import options as shared
+from splatwizard_core.cli.paths import INPUT_FILE, OUTPUT_FILE
+
+
+class Size(click.ParamType):  # type: ignore[type-arg]  # generic only in new releases of click
+    """A number of bytes: 500000, 500kB or 0.5MB; the units are decimal."""
+
+    name = "size"
+
+    def convert(self, value: str | int, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        found = re.fullmatch(r"(\d{1,15}(?:\.\d{1,9})?) ?(|[kMG])B?", str(value))
+        if found is None:
+            self.fail(f"{value!r} is no size, such as 500kB, 1.5MB or 500000", param, ctx)
+        return int(float(found[1]) * {"": 1, "k": 1e3, "M": 1e6, "G": 1e9}[found[2]])
+
+
+def part_options(size: str) -> Sequence[Callable[[shared.F], shared.F]]:
+    """Return the options for a part of a file with cuts, parameters packets, size and partial; `size` is called so."""
+    return (
+        click.option("--packets", type=click.IntRange(min=1), metavar="P",
+                     help="With cuts: the first P packets.  [default: all]"),
+        click.option(size, "size", type=Size(), metavar="SIZE",
+                     help="With cuts: the packets that fit, as into 500kB.  [default: all]"),
+        click.option("--partial", is_flag=True, help="With cuts: the packets that are whole, of a broken file."),
+    )  # fmt: skip
+
+
+@click.command(short_help="a shorter file of one with cuts")
+@click.argument("file", metavar="FILE.swz", type=INPUT_FILE)
+@shared.options(
+    *part_options("--size"),
+    click.option("--out", metavar="SHORT.swz", type=OUTPUT_FILE, required=True, help="The file to write."),
+    shared.json_option, shared.debug_option,
+)  # fmt: skip
+def truncate(file: Path, packets: int | None, size: int | None, partial: bool, out: Path, as_json: bool) -> None:
+    """Copy FILE.swz up to a cut that it declares: SHORT.swz is a whole file of fewer packets, nothing is decoded.
+
+    `sw info FILE.swz` lists the cuts. At least one of --packets, --size and --partial says which is meant.
+    """
+    from splatwizard_core.base.files import write_atomic
+    from splatwizard_core.coding.container import ContainerReader
+    from splatwizard_core.coding.cuts import Prefix
+    from splatwizard_core.errors import UserInputError
+
+    if packets is None and size is None and not partial:
+        raise click.UsageError("give --packets P, --size SIZE or --partial: `sw info FILE.swz` lists the cuts")
+    reader = ContainerReader.open(file, Prefix(packets, size, partial))
+    if not reader.cuts:
+        raise UserInputError(f"{file}: it declares no cuts, there is no shorter file in it")
+    with file.open("rb") as source:
+        write_atomic(out, source.read(reader.size))
+    facts = {"file": str(out), "packets": reader.packets, "bytes": reader.size}
+    told = f"{reader.packets} of {len(reader.cuts)} packets, {reader.size:,} of {file.stat().st_size:,} bytes: {out}"
+    shared.print_facts(facts, as_json, told)
