@@ -86,7 +86,7 @@ def test_a_room_is_small_enough_to_follow(room):
 
 def test_core_and_native_together_stay_small():
     lines = lines_in(files_of(CORE)) + lines_in(files_of(NATIVE))
-    assert lines < 17_322, f"core and native have {lines:,} lines"
+    assert lines < 17_110, f"core and native have {lines:,} lines"
 
 
 @pytest.mark.parametrize("room", sorted(ROOMS))
@@ -111,7 +111,7 @@ def test_no_modules_import_each_other():
 
 def test_the_longest_chain_of_imports_stays_short():
     # Plain tools are left out: whoever imports their names need not know their inside.
-    inside = {each for each in module_graph() if each.startswith(("splatwizard_native.", "splatwizard_core.base."))}
+    inside = {each for each in module_graph() if each.startswith(("splatwizard_native", "splatwizard_core.base."))}
     chain = longest_chain({module: uses - inside for module, uses in module_graph().items()})
     assert len(chain) <= 17, " -> ".join(chain)
 
