@@ -3,6 +3,7 @@
 # make test-geometry  the tests that need Open3D (100 MB), which it installs; Debian's libraries: sw doctor names them
 # make test-ray  the tests that need Ray (and submitit, for Slurm), which it installs
 # make test-wheels  that our wheels bring their kernels: built, installed and run where no compiler is; a quarter of an hour
+# make test-wasm  the decoder of .swz in WebAssembly: built again, and run in wasmtime, Node and Chromium
 # make docs-site  the pages under docs/ as a site, by mkdocs-material, which it installs
 # make lint   ruff and mypy
 # make bench  speed and memory, as ratios measured in one run
@@ -21,7 +22,7 @@ TEST_JOBS ?= 2
 # Whole files, so that fixtures are made once, in the order of conftest.py: the long ones first.
 TEST_DIST := --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test test-wheels test-geometry test-ray test-browser test-interchange docs-site coverage lint format bench kernels docs clean
+.PHONY: demo test test-wheels test-geometry test-ray test-browser test-interchange test-wasm docs-site coverage lint format bench kernels docs clean
 
 demo: $(VENV)/.ready
 	@tools/check-system compiler
@@ -58,6 +59,11 @@ test-interchange: $(VENV)/.ready-dev
 test-wheels: $(VENV)/.ready-dev
 	$(PIP) install -q ziglang
 	$(BIN)/python -m pytest -m slow tests/test_without_compiler.py tests/test_wasm_sources.py $(PYTEST_ARGS)
+
+# Needs node 20 or newer and a Chromium for the tests of those; they skip without.
+test-wasm: $(VENV)/.ready-dev
+	$(PIP) install -q ziglang==0.17.1 wasmtime==50.0.1
+	$(BIN)/python -m pytest -m slow plugins/sw-view/tests/test_decoder.py $(PYTEST_ARGS)
 
 docs-site: $(VENV)/.ready-dev
 	$(PIP) install -q -c constraints.txt mkdocs-material

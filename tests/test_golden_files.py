@@ -7,8 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from splatwizard_core.cli.main import main
 from splatwizard_core.coding.container import ContainerReader
 from splatwizard_core.plugins import load_plugins
+from splatwizard_core.runs.decode import decode_model
 
 GOLDEN = Path(__file__).parent / "golden"
 ROOT = Path(__file__).parents[1]
@@ -54,6 +56,15 @@ def test_todays_encoder_writes_the_same_sections_and_the_same_model(maker, name)
     assert maker.decoded_facts(maker.encoded(name), name)["parameters"] == FACTS[name]["parameters"]
     assert (fresh.method, fresh.version, fresh.static) == (golden.method, golden.version, golden.static)
     assert {s: fresh.section(s) for s in fresh.sections} == {s: golden.section(s) for s in golden.sections}
+
+
+def test_the_hash_for_other_decoders_is_over_the_parameters_in_their_order(capsys):
+    path = GOLDEN / "3dgs_r1_v1.swz"
+    model = decode_model(ContainerReader.open(path), load_plugins())
+    values = (model.means, model.log_scales, model.quats, model.opacity_logits, model.sh_dc, model.sh_rest)
+    content = b"".join(value.detach().numpy().astype("<f4").tobytes() for value in values)
+    assert main(["decode", str(path), "--hash"]) == 0
+    assert capsys.readouterr().out == f"{hashlib.sha256(content).hexdigest()}\n"
 
 
 def test_golden_files_are_small():

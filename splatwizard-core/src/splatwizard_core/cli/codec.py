@@ -67,6 +67,7 @@ def encode(source: Path, out: Path | None, no_psnr: bool, as_json: bool, chosen:
         "--repeats", type=click.IntRange(min=0), default=3, show_default=True, metavar="N",
         help="Timed decodes after the first one; their median is reported.",
     ),
+    click.option("--hash", "hash_only", is_flag=True, help="Print nothing but SHA-256 of the decoded parameters."),
     *part_options("--bytes"),
     shared.set_option, shared.device_option, shared.json_option, shared.debug_option,
 )  # fmt: skip
@@ -75,6 +76,7 @@ def decode(
     file: Path,
     out: Path | None,
     repeats: int,
+    hash_only: bool,
     packets: int | None,
     size: int | None,
     partial: bool,
@@ -82,12 +84,17 @@ def decode(
     chosen: Choices,
 ) -> None:
     """Decode FILE.swz from nothing but itself; report time, counts and the digest of the model."""
+    from splatwizard_core.coding.container import ContainerReader
     from splatwizard_core.coding.cuts import Prefix
-    from splatwizard_core.runs.decode import save_decoded, timed_decode
+    from splatwizard_core.runs.decode import decode_model, save_decoded, timed_decode
 
     plugins = load_plugins()
+    prefix = Prefix(packets, size, partial)
+    if hash_only:
+        click.echo(decode_model(ContainerReader.open(file, prefix), plugins).parameter_hash())
+        return
     session = open_session(chosen.resolve_without_method(), plugins)
-    model, facts = timed_decode(file, session, repeats=repeats, prefix=Prefix(packets, size, partial))
+    model, facts = timed_decode(file, session, repeats=repeats, prefix=prefix)
     if out is not None:
         save_decoded(model, facts, out, plugins)
     printed = facts.model_dump(mode="json") | ({} if out is None else {"out": str(out)})

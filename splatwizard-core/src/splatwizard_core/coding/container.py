@@ -1,19 +1,7 @@
 """The single file (`.swz`): everything that a decoder needs, in named sections, each with length and CRC-32.
 
-Layout, little-endian, byte by byte in docs/bitstream.md:
-
-    4 bytes   magic "SPWZ"
-    u16       container version: 1, or 2 if the header declares cuts
-    u32       header length H
-    H bytes   header, UTF-8 JSON
-    u32       CRC-32 of the H header bytes
-    ...       the sections, back to back in the order of the section table
-
-The header holds `method`, `method_version`, `requires` (which distributions wrote it, see requirements.py), `raster`
-(what a renderer must do, such as {"antialias": false}), `static` (whatever the method wants to remember) and
-`sections`, a list of [name, offset, length, crc32] whose offsets count from the end of the header's CRC; in version 2
-also `cuts` (see cuts.py), and the file may end at any of them.
-Source: specification of the codec library, container.
+Layout and keys of the header: docs/bitstream.md, chapter 1. In version 2 the
+header also holds `cuts` (see cuts.py), and the file may end at any of them. Source: specification of the codec library, container.
 """
 
 from __future__ import annotations

@@ -99,3 +99,11 @@ class SplatModel(nn.Module):
             if tensor.numel():  # an empty tensor cannot be seen as bytes
                 sha.update(tensor.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().tobytes())
         return sha.hexdigest()
+
+    def parameter_hash(self) -> str:
+        """SHA-256 of the parameters alone, as decoders in any language compute it (docs/bitstream.md, chapter 8)."""
+        first = ["means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest"]  # then all others by name
+        found = dict(self.named_parameters())
+        names = sorted(found, key=lambda name: (first.index(name) if name in first else len(first), name))
+        parts = (found[name].detach().cpu().numpy().astype("<f4").tobytes() for name in names)
+        return hashlib.sha256(b"".join(parts)).hexdigest()

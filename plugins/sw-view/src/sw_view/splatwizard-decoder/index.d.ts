@@ -1,0 +1,54 @@
+/** Gaussians of a .swz file. Row i of each array belongs to Gaussian i. */
+export interface Gaussians {
+  /** How many. */
+  count: number;
+  /** SH degree, 0 to 3; K = (degree + 1)^2. */
+  degree: number;
+  /** [count, 3], world units; axes as in COLMAP and 3DGS. */
+  means: Float32Array;
+  /** [count, 4], w, x, y, z, not always of unit length. */
+  quats: Float32Array;
+  /** [count, 3], standard deviations along the axes of the rotation, world units. A surfel's third one is 1e-8. */
+  scales: Float32Array;
+  /** [count], 0 to 1. */
+  opacities: Float32Array;
+  /** [count, K, 3], coefficients of red, green and blue: colour = 0.5 + sum of basis * coefficient. */
+  sh: Float32Array;
+  /** The header of the file. */
+  meta: Header;
+  /** SHA-256 of the decoded parameters, if it was asked for: what `sw decode --hash` prints. */
+  hash: string | null;
+}
+
+/** The header, as docs/bitstream.md of Splatwizard has it. */
+export interface Header {
+  method: string;
+  method_version: number;
+  requires?: Record<string, string[]>;
+  /** What the scene asks of a rasterizer, such as `antialias`. */
+  raster: Record<string, unknown>;
+  static: Record<string, unknown>;
+  /** Name, offset, length and CRC-32 of each section. */
+  sections: [string, number, number, number][];
+}
+
+export interface Options {
+  /** Ends the decoding early. */
+  signal?: AbortSignal;
+  /** Whether to compute the hash of the decoded parameters. */
+  hash?: boolean;
+  /** Whether to decode in a thread of its own; the default where the platform has `Worker`. */
+  worker?: boolean;
+}
+
+/** What is wrong with a file; the message is that of the Python reader. */
+export class DecodeError extends Error {
+  /** The section that is to blame, or null: the file or its header. */
+  section: string | null;
+}
+
+/** Decodes a file. Rejects with DecodeError for one that is damaged, or that needs more than this decoder knows. */
+export function decode(source: Uint8Array | ArrayBuffer | Response | Blob, options?: Options): Promise<Gaussians>;
+
+/** The header of a file, unchecked but for its form. */
+export function info(bytes: Uint8Array): Header;

@@ -1,0 +1,72 @@
+// The WebAssembly module and what drives it: a file in, named arrays out. It knows neither files nor networks nor workers.
+
+/** What is wrong with a file, in the words of the Python reader: `section 'sh1': its CRC-32 does not match: ...`. */
+export class DecodeError extends Error {
+  constructor(reason) {
+    super(reason);
+    this.name = 'DecodeError';
+    /** Name of the section that is to blame, or null: the file or its header. */
+    this.section = /^section '([^']*)'/.exec(reason)?.[1] ?? null;
+  }
+}
+
+const MAX_HEADER = 1 << 19;
+
+/** The header of a file: method, method_version, requires, raster, static, sections. Checks only what it needs. */
+export function info(bytes) {
+  const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
+  if (bytes.length < 10 || view.getUint32(0, false) !== 0x5350575a) throw new DecodeError('not a .swz file');
+  const length = view.getUint32(6, true);
+  if (length > MAX_HEADER || 14 + length > bytes.length) throw new DecodeError('the file ends inside its header: it is truncated');
+  try {
+    return JSON.parse(new TextDecoder('utf-8', { fatal: true }).decode(bytes.subarray(10, 10 + length)));
+  } catch (error) {
+    throw new DecodeError(`header is not acceptable JSON: ${error.message}`);
+  }
+}
+
+/**
+ * The parameters in a file by name, each { shape, data: Float32Array }; with `hash` the SHA-256 of them, which
+ * `sw decode --hash` prints. An instance of the module lives for this call only, and with it all memory but the result.
+ */
+export function parameters(module, bytes, { hash = false } = {}) {
+  const { exports } = new WebAssembly.Instance(module, {});
+  exports._initialize();
+  const text = at => {
+    const memory = new Uint8Array(exports.memory.buffer, at);
+    return new TextDecoder().decode(memory.subarray(0, memory.indexOf(0)));
+  };
+  try {
+    const at = exports.swz_input(bytes.length);
+    new Uint8Array(exports.memory.buffer, at, bytes.length).set(bytes);
+    exports.swz_decode();
+  } catch (error) {
+    if (!(error instanceof WebAssembly.RuntimeError)) throw error;
+    throw new DecodeError(text(exports.swz_refusal()) || `the decoder failed: ${error.message}`);
+  }
+  const FIELDS = 7, arrays = {};  // pointers to name and values, number of axes, four lengths
+  const fields = new Uint32Array(exports.memory.buffer, exports.swz_arrays(), FIELDS * exports.swz_count());
+  for (let i = 0; i < fields.length; i += FIELDS) {
+    const shape = [...fields.subarray(i + 3, i + 3 + fields[i + 2])];
+    const size = shape.reduce((a, b) => a * b, 1);
+    arrays[text(fields[i])] = { shape, data: new Float32Array(exports.memory.buffer, fields[i + 1], size).slice() };
+  }
+  return { arrays, hash: hash ? text(exports.swz_hash()) : null };
+}
+
+const SURFEL_THICKNESS = 1e-8;  // world units, as `sw export` gives surfels a third axis
+
+/** Gaussians as a renderer wants them, of what `parameters` gave. */
+export function gaussians(bytes, { arrays, hash }) {
+  const { means, log_scales, quats, opacity_logits, sh_dc, sh_rest } = arrays;
+  const count = means.shape[0], rest = 3 * sh_rest.shape[1], axes = log_scales.shape[1];
+  const scales = new Float32Array(3 * count).fill(SURFEL_THICKNESS), sh = new Float32Array((3 + rest) * count);
+  for (let i = 0; i < count; i++) {
+    for (let k = 0; k < axes; k++) scales[3 * i + k] = Math.exp(log_scales.data[axes * i + k]);
+    sh.set(sh_dc.data.subarray(3 * i, 3 * i + 3), (3 + rest) * i);
+    sh.set(sh_rest.data.subarray(rest * i, rest * (i + 1)), (3 + rest) * i + 3);
+  }
+  const opacities = opacity_logits.data.map(x => 1 / (1 + Math.exp(-x)));
+  const degree = Math.sqrt(1 + rest / 3) - 1;
+  return { count, degree, means: means.data, quats: quats.data, scales, opacities, sh, meta: info(bytes), hash };
+}

@@ -1,0 +1,84 @@
+#include "base.h"
+
+namespace swz {
+
+Text refusal;
+const char* blamed = nullptr;
+
+void Text::put(int64_t value, bool grouped) {
+  char digits[32];
+  int at = sizeof(digits) - 1, written = 0;
+  uint64_t left = value < 0 ? 0 - static_cast<uint64_t>(value) : static_cast<uint64_t>(value);
+  digits[at] = 0;
+  do {
+    if (grouped && written && written % 3 == 0) digits[--at] = ',';
+    digits[--at] = static_cast<char>('0' + left % 10);
+    left /= 10;
+    ++written;
+  } while (left);
+  if (value < 0) digits[--at] = '-';
+  put(digits + at);
+}
+
+namespace {
+
+uint32_t crc_tables[8][256];
+
+void make_crc_tables() {
+  for (uint32_t i = 0; i < 256; ++i) {
+    uint32_t value = i;
+    for (int bit = 0; bit < 8; ++bit) value = value >> 1 ^ (value & 1 ? 0xEDB88320u : 0u);
+    crc_tables[0][i] = value;
+  }
+  for (int table = 1; table < 8; ++table)
+    for (int i = 0; i < 256; ++i) {
+      const uint32_t value = crc_tables[table - 1][i];
+      crc_tables[table][i] = value >> 8 ^ crc_tables[0][value & 255];
+    }
+}
+
+}  // namespace
+
+uint32_t crc32(const void* bytes, int64_t count, uint32_t before) {
+  if (crc_tables[0][1] == 0) make_crc_tables();
+  const auto& t = crc_tables;
+  const auto* data = static_cast<const uint8_t*>(bytes);
+  uint32_t crc = ~before;
+  for (; count >= 8; count -= 8, data += 8) {  // eight bytes a turn, each by the table of what follows it
+    uint32_t low, high;
+    std::memcpy(&low, data, 4);
+    std::memcpy(&high, data + 4, 4);
+    low ^= crc;
+    crc = t[7][low & 255] ^ t[6][low >> 8 & 255] ^ t[5][low >> 16 & 255] ^ t[4][low >> 24] ^ t[3][high & 255] ^
+          t[2][high >> 8 & 255] ^ t[1][high >> 16 & 255] ^ t[0][high >> 24];
+  }
+  for (; count > 0; --count) crc = crc >> 8 ^ t[0][(crc ^ *data++) & 255];
+  return ~crc;
+}
+
+uint64_t Bytes::varint(uint64_t limit) {
+  uint64_t value = 0;
+  for (int i = 0; i < 10; ++i) {
+    const uint64_t byte = integer(1);
+    if (i == 9 && byte > 1 && byte < 128) refuse("an integer has too many bytes");
+    value |= (byte & 127) << (7 * i);
+    if (byte < 128) {
+      if (value > limit || (byte == 0 && i > 0))
+        refuse("an integer is ", grouped(static_cast<int64_t>(value)), ", at most ",
+               grouped(static_cast<int64_t>(limit)), " is allowed");
+      return value;
+    }
+  }
+  refuse("an integer has too many bytes");
+}
+
+}  // namespace swz
+
+// What the kernels throw when memory runs out ends the decoding too.
+extern "C" {
+void* __cxa_allocate_exception(size_t) noexcept {
+  swz::blamed = nullptr;
+  swz::refuse("the decoder has no more memory");
+}
+void __cxa_throw(void*, void*, void (*)(void*)) { __builtin_trap(); }
+}

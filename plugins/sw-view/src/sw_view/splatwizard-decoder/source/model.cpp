@@ -1,0 +1,43 @@
+#include "model.h"
+
+namespace swz {
+
+Model3D decoded;
+
+float* Model3D::add(const char* name, int64_t first, int64_t second, int64_t third) {
+  Array& array = arrays[count++];
+  array = {name, nullptr, 0, {}};
+  int64_t size = 1;
+  for (const int64_t length : {first, second, third}) {
+    if (length < 0) break;
+    array.shape[array.axes++] = static_cast<uint32_t>(length);
+    size *= length;
+  }
+  Buffer<float> values(size);
+  values.clear();
+  array.data = values.data;
+  values.data = nullptr;  // it stays as long as the instance
+  return array.data;
+}
+
+void Model3D::check_finite() const {
+  for (int i = 0; i < count; ++i) {
+    int64_t size = 1;
+    for (int axis = 0; axis < arrays[i].axes; ++axis) size *= arrays[i].shape[axis];
+    for (int64_t k = 0; k < size; ++k)
+      if (!__builtin_isfinite(arrays[i].data[k]))
+        refuse("decoded '", arrays[i].name, "' is not finite: the file is damaged or hostile");
+  }
+}
+
+Gaussians::Gaussians(int64_t gaussians, int64_t sh_degree, int64_t scales)
+    : count(gaussians), rest((sh_degree + 1) * (sh_degree + 1) - 1) {
+  means = decoded.add("means", count, 3);
+  log_scales = decoded.add("log_scales", count, scales);
+  quats = decoded.add("quats", count, 4);
+  opacity_logits = decoded.add("opacity_logits", count);
+  sh_dc = decoded.add("sh_dc", count, 1, 3);
+  sh_rest = decoded.add("sh_rest", count, rest, 3);
+}
+
+}  // namespace swz

@@ -1,0 +1,286 @@
+// Gaussians on a lattice: positions by `octree`, all else by `columns` (docs/bitstream.md, 3dgs, quantized).
+//
+// What a column decodes to goes into the model at once: no matrix of all integers is ever in memory. All arithmetic is
+// that of the page, float64 in the order written.
+#include <algorithm>
+
+#include "columns.h"
+#include "gaussian_files.h"
+#include "model.h"
+#include "points.h"
+
+namespace swz {
+
+namespace {
+
+constexpr int64_t MAX_SYMBOL = 1 << 30;
+
+// Header values that a method keeps beside those of the codec.
+constexpr const char* BESIDE[] = {"entropy", "positions", "mode", "codec", "method", "depth_ratio", "lambda_dist",
+                                  "lambda_normal", "world_origin"};
+constexpr const char* KEYS[] = {"num_gaussians", "max_sh_degree", "active_sh_degree", "position_bits", "center",
+                                "width", "top", "dc_step", "rest_step", "opacity_step", "scale_step", "quat_step",
+                                "sh_classes", "primitive"};
+
+struct Layout {
+  int64_t count, degree, active, bits, classes, scales;
+  double center[3], width[3], top[3];
+  double dc_step, rest_step, opacity_step, scale_step, quat_step;
+};
+
+[[noreturn]] void wrong(const char* key, const char* reason) { refuse("header value '", key, "': ", reason); }
+
+const Json* stated(const Container& file, const char* key) {
+  const Json* found = file.value(key);
+  if (found == nullptr) wrong(key, "Field required");
+  return found;
+}
+
+int64_t integer(const Container& file, const char* key, int64_t low, int64_t high) {
+  const Json* found = stated(file, key);
+  if (found->kind != Json::INTEGER) wrong(key, "Input should be a valid integer");
+  if (found->integer < low)
+    refuse("header value '", key, "': Input should be greater than or equal to ", low);
+  if (found->integer > high) {
+    if (high == UINT32_MAX) wrong(key, "Input should be less than 4294967296");
+    refuse("header value '", key, "': Input should be less than or equal to ", high);
+  }
+  return found->integer;
+}
+
+double step(const Container& file, const char* key) {
+  const Json* found = stated(file, key);
+  if (!found->is_number()) wrong(key, "Input should be a valid number");
+  if (!(found->number > 0)) wrong(key, "Input should be greater than 0");
+  if (!(found->number <= 1000)) wrong(key, "Input should be less than or equal to 1000");
+  return found->number;
+}
+
+void three(const Container& file, const char* key, bool integers, double* to) {
+  const Json* found = stated(file, key);
+  if (found->kind != Json::ARRAY) wrong(key, "Input should be a valid tuple");
+  const Json* each = found->first;
+  for (int i = 0; i < 3; ++i, each = each->next) {
+    Text place;
+    place.put(key), place.put("."), place.put(int64_t{i});
+    if (each == nullptr) wrong(place.data, "Field required");
+    if (integers && each->kind != Json::INTEGER) wrong(place.data, "Input should be a valid integer");
+    if (!each->is_number()) wrong(place.data, "Input should be a valid number");
+    to[i] = each->number;
+  }
+  if (found->length > 3)
+    refuse("header value '", key, "': Tuple should have at most 3 items after validation, not ",
+           static_cast<int64_t>(found->length));
+}
+
+Layout layout_of(const Container& file) {
+  Layout found;
+  found.count = integer(file, "num_gaussians", 0, UINT32_MAX);
+  found.degree = integer(file, "max_sh_degree", 0, 3);
+  found.active = integer(file, "active_sh_degree", 0, 3);
+  found.bits = integer(file, "position_bits", 1, 21);
+  three(file, "center", false, found.center);
+  three(file, "width", false, found.width);
+  three(file, "top", true, found.top);
+  found.dc_step = step(file, "dc_step");
+  found.rest_step = step(file, "rest_step");
+  found.opacity_step = step(file, "opacity_step");
+  found.scale_step = step(file, "scale_step");
+  found.quat_step = step(file, "quat_step");
+  found.classes = integer(file, "sh_classes", 1, 16);
+  const Json* primitive = file.value("primitive");
+  if (primitive != nullptr && primitive->kind != Json::NOTHING && !primitive->is("surfel"))
+    wrong("primitive", "Input should be 'surfel'");
+  found.scales = primitive != nullptr && primitive->kind == Json::STRING ? 2 : 3;
+  for (const Json* key = file.header->find("static")->first; key != nullptr; key = key->next) {
+    const auto same = [&](const char* name) { return std::strcmp(name, key->key) == 0; };
+    if (std::none_of(BESIDE, std::end(BESIDE), same) && std::none_of(KEYS, std::end(KEYS), same))
+      wrong(key->key, "Extra inputs are not permitted");
+  }
+  for (const char* part : {"entropy", "positions"})
+    if (const Json* name = file.value(part); name != nullptr)
+      refuse("the file asks for ", part, " '", name->text, "', which this decoder lacks");
+  if (found.active > found.degree) refuse("header activates more SH bands than there are");
+  for (int axis = 0; axis < 3; ++axis)
+    if (!(found.width[axis] > 0 && found.width[axis] < 1e30 && found.top[axis] >= 1 && found.top[axis] <= 40))
+      refuse("header describes no usable position grid");
+  return found;
+}
+
+// The coordinate of a cell on an axis.
+double coordinate(const Layout& layout, int axis, int64_t cell) {
+  const double top = layout.top[axis];
+  const double v = (static_cast<double>(cell) + 0.5) * (2 * top * (1.0 / static_cast<double>(int64_t{1} << layout.bits))) - top;
+  const double a = __builtin_fabs(v);
+  double u = a;
+  if (!(a < 1.0)) {
+    const double octave = __builtin_floor(a);
+    u = (1.0 + (a - octave)) * static_cast<double>(int64_t{1} << (static_cast<int64_t>(octave) - 1));
+  }
+  return __builtin_copysign(u, v) * layout.width[axis] + layout.center[axis];
+}
+
+void put_means(const Layout& layout, const Points& points, float* means) {
+  for (int64_t i = 0; i < layout.count; ++i)
+    for (int axis = 0; axis < 3; ++axis)
+      means[3 * i + axis] = static_cast<float>(coordinate(layout, axis, points.coordinate(i, axis)));
+}
+
+// A column of integers that must not be beyond 2^30; what is, is refused once the whole matrix is known to be sound.
+struct Matrix {
+  Columns columns;
+  Buffer<int64_t> values;
+  bool beyond = false;
+
+  Matrix(Bytes data, int64_t rows, int64_t width) : columns(data, rows, width), values(rows) {}
+  const int64_t* next() {
+    columns.next(values.data);
+    for (int64_t i = 0; i < columns.rows; ++i) beyond |= values[i] < -MAX_SYMBOL || values[i] > MAX_SYMBOL;
+    return values.data;
+  }
+  void finish() {
+    columns.finish();
+    if (beyond) refuse("a quantised value is beyond 2^30");
+  }
+};
+
+const double A = 1 / __builtin_sqrt(3.0), B = 1 / __builtin_sqrt(2.0), C = 1 / __builtin_sqrt(6.0),
+             D = -2 / __builtin_sqrt(6.0);
+
+// Three columns as luma, red-blue and green-magenta; row i of them goes to to[stride * row(i)]. What is activity, the sum
+// of their magnitudes, is added where it is asked for.
+template <class Row>
+void put_color(Matrix& matrix, double step, float* to, int64_t stride, const Row& row, int64_t* activity) {
+  const int64_t rows = matrix.columns.rows;
+  Buffer<int32_t> symbols[2] = {Buffer<int32_t>(rows), Buffer<int32_t>(rows)};
+  for (auto& column : symbols) {
+    const int64_t* values = matrix.next();
+    for (int64_t i = 0; i < rows; ++i) column[i] = static_cast<int32_t>(values[i]);
+  }
+  const int64_t* last = matrix.next();
+  for (int64_t i = 0; i < rows; ++i) {
+    const double y = symbols[0][i] * step, u = symbols[1][i] * step, v = static_cast<double>(last[i]) * step;
+    float* rgb = to + stride * row(i);
+    rgb[0] = static_cast<float>(A * y + B * u + C * v);
+    rgb[1] = static_cast<float>(A * y + 0.0 * u + D * v);
+    rgb[2] = static_cast<float>(A * y + -B * u + C * v);
+    if (activity != nullptr)
+      activity[row(i)] += std::abs(int64_t{symbols[0][i]}) + std::abs(int64_t{symbols[1][i]}) + std::abs(last[i]);
+  }
+}
+
+void put_columns(Matrix& matrix, double step, float* to) {
+  const int64_t width = matrix.columns.width;
+  for (int64_t c = 0; c < width; ++c) {
+    const int64_t* values = matrix.next();
+    for (int64_t i = 0; i < matrix.columns.rows; ++i)
+      to[width * i + c] = static_cast<float>(static_cast<double>(values[i]) * step);
+  }
+}
+
+void put_quats(Matrix& matrix, double step, float* to) {
+  const int64_t rows = matrix.columns.rows;
+  Buffer<int32_t> symbols[2] = {Buffer<int32_t>(rows), Buffer<int32_t>(rows)};
+  for (auto& column : symbols) {
+    const int64_t* values = matrix.next();
+    for (int64_t i = 0; i < rows; ++i) column[i] = static_cast<int32_t>(values[i]);
+  }
+  const int64_t* last = matrix.next();
+  for (int64_t i = 0; i < rows; ++i) {
+    const double x = symbols[0][i] * step, y = symbols[1][i] * step, z = static_cast<double>(last[i]) * step;
+    const double squared = x * x + y * y + z * z;
+    const double w = __builtin_sqrt(1.0 - squared > 0.0 ? 1.0 - squared : 0.0);
+    const double norm = __builtin_sqrt(squared > 1.0 ? squared : 1.0);
+    to[4 * i] = static_cast<float>(w / norm);
+    to[4 * i + 1] = static_cast<float>(x / norm);
+    to[4 * i + 2] = static_cast<float>(y / norm);
+    to[4 * i + 3] = static_cast<float>(z / norm);
+  }
+}
+
+// The class of each row by its activity, the rows being cut into `count` parts of about equal size.
+Buffer<uint8_t> classes_of(const Buffer<int64_t>& activity, int64_t count) {
+  Buffer<uint8_t> classes(activity.size);
+  classes.clear();
+  if (count == 1 || activity.size == 0) return classes;
+  Buffer<int64_t> ordered(activity.size);
+  std::memcpy(ordered.data, activity.data, sizeof(int64_t) * static_cast<size_t>(activity.size));
+  for (int64_t i = 1; i < count; ++i) {
+    int64_t* limit = ordered.data + activity.size * i / count;
+    std::nth_element(ordered.data, limit, ordered.data + activity.size);
+    const int64_t reached = *limit;
+    for (int64_t row = 0; row < activity.size; ++row) classes[row] += activity[row] >= reached;
+  }
+  return classes;
+}
+
+void put_band(Bytes data, const Layout& layout, int band, Buffer<int64_t>& activity, Gaussians& to) {
+  const int64_t count = band == 1 ? 1 : layout.classes;
+  const Buffer<uint8_t> classes = classes_of(activity, count);
+  if (data.left < 4 * count) refuse(data.left, " bytes cannot hold the lengths of ", count, " classes");
+  const int64_t size = data.left;
+  int64_t lengths[16], sum = 4 * count;
+  for (int64_t k = 0; k < count; ++k) sum += lengths[k] = static_cast<int64_t>(data.integer(4));
+  if (sum != size) refuse(grouped(size), " bytes, the class lengths say ", grouped(sum));
+  Buffer<uint32_t> rows(layout.count);
+  for (int64_t k = 0; k < count; ++k) {
+    int64_t found = 0;
+    for (int64_t i = 0; i < layout.count; ++i)
+      if (classes[i] == k) rows[found++] = static_cast<uint32_t>(i);
+    if ((found == 0) != (lengths[k] == 0))
+      refuse("class ", k, " has ", grouped(found), " rows, but ", grouped(lengths[k]), " bytes");
+    const Bytes part = data.take(lengths[k]);
+    if (found == 0) continue;
+    Matrix matrix(part, found, 3 * (2 * band + 1));
+    for (int coefficient = band * band - 1; coefficient < (band + 1) * (band + 1) - 1; ++coefficient)
+      put_color(matrix, layout.rest_step, to.sh_rest + 3 * coefficient, 3 * to.rest,
+                [&](int64_t i) { return static_cast<int64_t>(rows[i]); }, activity.data);
+    matrix.finish();
+  }
+}
+
+}  // namespace
+
+void decode_quantized(Container& file) {
+  const Layout layout = layout_of(file);
+  const int64_t n = layout.count;
+  file.allow(4 * n * (8 + layout.scales + 3 * (layout.degree + 1) * (layout.degree + 1)), n);
+  Gaussians to(n, layout.degree, layout.scales);
+  const auto matrix_of = [&](const char* name, int64_t width, const auto& put) {
+    const Bytes data = file.section(name);
+    const Blame blame(name);
+    Matrix matrix(data, n, width);
+    put(matrix);
+    matrix.finish();
+  };
+  {
+    const Bytes data = file.section("positions");
+    const Blame blame("positions");
+    const Points points = octree(data);
+    if (points.codes.size != n) refuse("holds ", grouped(points.codes.size), " points, header says ", grouped(n));
+    if (n && points.bits > layout.bits) {
+      int64_t highest = 0;
+      for (int64_t i = 0; i < n; ++i)
+        for (int axis = 0; axis < 3; ++axis) highest |= points.coordinate(i, axis);
+      if (highest >> layout.bits) refuse("a point leaves the grid of ", layout.bits, " bits");
+    }
+    put_means(layout, points, to.means);
+  }
+  matrix_of("color", 3, [&](Matrix& matrix) {
+    put_color(matrix, layout.dc_step, to.sh_dc, 3, [](int64_t i) { return i; }, nullptr);
+  });
+  matrix_of("opacity", 1, [&](Matrix& matrix) { put_columns(matrix, layout.opacity_step, to.opacity_logits); });
+  matrix_of("scales", layout.scales, [&](Matrix& matrix) { put_columns(matrix, layout.scale_step, to.log_scales); });
+  matrix_of("quats", 3, [&](Matrix& matrix) { put_quats(matrix, layout.quat_step, to.quats); });
+  Buffer<int64_t> activity(n);
+  activity.clear();
+  const char* bands[] = {"sh1", "sh2", "sh3"};
+  for (int band = 1; band <= layout.active; ++band) {
+    const Bytes data = file.section(bands[band - 1]);
+    const Blame blame(bands[band - 1]);
+    put_band(data, layout, band, activity, to);
+  }
+  decoded.check_finite();
+}
+
+}  // namespace swz

@@ -1,0 +1,196 @@
+"""The WebAssembly decoder gives what the Python decoder gives, in wasmtime, Node and Chromium.
+
+`make test-wasm` runs it; each test skips where its engine is not installed.
+"""
+
+from __future__ import annotations
+
+import functools
+import http.server
+import importlib.util
+import json
+import shutil
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import sw_view
+from headless_chromium import Chromium, find_chromium
+
+from splatwizard_core.coding.container import ContainerReader
+from splatwizard_core.errors import BitstreamError
+from splatwizard_core.plugins import load_plugins
+from splatwizard_core.runs.decode import decode_model
+
+pytestmark = pytest.mark.slow
+ROOT = Path(__file__).parents[3]
+FOLDER = Path(sw_view.__file__).parent / "splatwizard-decoder"
+GOLDEN = sorted((ROOT / "tests" / "golden").glob("*.swz"))
+LACKING = ("c3dgs", "cat_3dgs", "chimerags", "compact3dgs", "hac", "lightgaussian", "mesongs", "wisp")
+"""Beginnings of the names of golden files that the decoder does not know yet."""
+LACKING_CODECS = ("2dgs_ply_v1", "2dgs_zstd_v1", "trimming_the_fat_ply_v1", "trimming_the_fat_zstd_v1")
+COVERED = [path for path in GOLDEN if not path.stem.startswith(LACKING) and path.stem not in LACKING_CODECS]
+needs_wasmtime = pytest.mark.skipif(importlib.util.find_spec("wasmtime") is None, reason="wasmtime is not installed")
+needs_node = pytest.mark.skipif(shutil.which("node") is None, reason="Node is not installed")
+needs_ziglang = pytest.mark.skipif(importlib.util.find_spec("ziglang") is None, reason="ziglang is not installed")
+needs_chromium = pytest.mark.skipif(find_chromium() is None, reason="no Chromium is installed")
+
+
+def told(data: bytes, name: str = "file") -> tuple[str | None, str | None]:
+    """Hash, or reason, as the Python decoder has it."""
+    try:
+        return decode_model(ContainerReader(data, name), load_plugins()).parameter_hash(), None
+    except BitstreamError as error:
+        return None, str(error).removeprefix(f"{name}: ")
+
+
+@functools.cache
+def expected() -> list[tuple[str | None, str | None]]:
+    return [told(path.read_bytes()) for path in COVERED]
+
+
+class Wasmtime:
+    """The module in wasmtime; an instance a file."""
+
+    def __init__(self) -> None:
+        import wasmtime
+
+        self.api, self.engine = wasmtime, wasmtime.Engine()
+        self.module = wasmtime.Module.from_file(self.engine, str(FOLDER / "decoder.wasm"))
+
+    def told(self, data: bytes, memory: int = -1) -> tuple[str | None, str | None]:
+        """Hash or reason; `memory` is the most bytes that the instance may have."""
+        store = self.api.Store(self.engine)
+        store.set_limits(memory_size=memory)
+        exports = self.api.Instance(store, self.module, []).exports(store)
+        exports["_initialize"](store)
+
+        def text(at: int) -> str:
+            return bytes(exports["memory"].read(store, at, at + 1024)).partition(b"\0")[0].decode()
+
+        try:
+            exports["memory"].write(store, data, exports["swz_input"](store, len(data)))
+            exports["swz_decode"](store)
+        except self.api.Trap:
+            return None, text(exports["swz_refusal"](store))
+        return text(exports["swz_hash"](store)), None
+
+
+@pytest.fixture(scope="module")
+def wasmtime() -> Wasmtime:
+    return Wasmtime()
+
+
+def in_node(paths: list[Path]) -> list[tuple[str | None, str | None]]:
+    script = Path(__file__).with_name("decode_files.mjs")
+    done = subprocess.run(["node", script, *paths], capture_output=True, text=True, check=True)
+    return [tuple(json.loads(line)) for line in done.stdout.splitlines()]
+
+
+def with_crcs(data: bytes, name: str, change: dict[int, int]) -> bytes:
+    """The file with some bytes of a section changed, so that no CRC-32 of the container tells of it."""
+    from splatwizard_core.coding.container import ContainerWriter
+
+    reader = ContainerReader(data)
+    writer = ContainerWriter(reader.method, reader.version, raster=reader.raster)
+    writer.static.update(reader.static)
+    for each in reader.sections:
+        content = bytearray(reader.section(each))
+        if each == name:
+            for at, flip in change.items():
+                content[at] ^= flip
+        writer.add(each, content)
+    return writer.to_bytes()
+
+
+@functools.cache
+def tampered() -> list[bytes]:
+    """A golden file damaged in each section: as it comes from the disk, and behind sound CRCs."""
+    found = []
+    data = (ROOT / "tests" / "golden" / "3dgs_r3_v1.swz").read_bytes()
+    reader, at = ContainerReader(data), ContainerReader(data).header_bytes
+    for name, size in reader.sections.items():
+        flipped = bytearray(data)
+        flipped[at + size // 2] ^= 0x10
+        found += [bytes(flipped), data[: at + size // 2], with_crcs(data, name, {size // 2: 0x10})]
+        found += [with_crcs(data, name, {0: 2}), with_crcs(data, name, {size - 1: 0x80})]
+        at += size
+    flipped = bytearray(data)
+    flipped[20] ^= 1
+    return [*found, bytes(flipped), data[:9], data[:40], b"", data + b"\0"]
+
+
+@needs_wasmtime
+def test_wasmtime_gives_the_hashes_of_the_python_decoder(wasmtime):
+    assert [wasmtime.told(path.read_bytes()) for path in COVERED] == expected()
+
+
+@needs_node
+def test_node_gives_the_hashes_of_the_python_decoder():
+    assert in_node(COVERED) == expected()
+
+
+@needs_chromium
+def test_chromium_gives_the_hashes_of_the_python_decoder(tmp_path):
+    """In a worker, from the folder as it is published, over HTTP."""
+    (tmp_path / "package").symlink_to(FOLDER)
+    (tmp_path / "golden").symlink_to(GOLDEN[0].parent)
+    (tmp_path / "page.html").write_text("<!doctype html><title>decoder</title>")
+    handler = functools.partial(Quiet, directory=tmp_path)
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        browser = Chromium(find_chromium(), tmp_path / "profile")
+        try:
+            address = f"http://127.0.0.1:{server.server_address[1]}/page.html"
+            browser.open(SimpleNamespace(resolve=lambda: SimpleNamespace(as_uri=lambda: address)), width=800)
+            names = json.dumps([path.name for path in COVERED])
+            found = browser.ask(f"""(async () => {{
+              const {{ decode }} = await import('/package/index.js');
+              const found = [];
+              for (const name of {names}) found.push(await decode(await fetch('/golden/' + name), {{ hash: true }}));
+              return found.map(each => each.hash);
+            }})()""")
+        finally:
+            browser.close()
+            server.shutdown()
+    assert found == [sha for sha, _ in expected()]
+
+
+class Quiet(http.server.SimpleHTTPRequestHandler):
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@needs_wasmtime
+def test_a_tampered_file_gives_the_same_reason(wasmtime):
+    found = [wasmtime.told(data) for data in tampered()]
+    assert found == [told(data) for data in tampered()]
+    assert len({reason for _, reason in found}) > 10
+
+
+@needs_node
+def test_the_reason_reaches_javascript(tmp_path):
+    (tmp_path / "x.swz").write_bytes(tampered()[0])
+    assert in_node([tmp_path / "x.swz"]) == [told(tampered()[0])]
+
+
+@needs_wasmtime
+def test_a_file_it_does_not_know_is_refused_by_name(wasmtime):
+    for path in sorted(set(GOLDEN) - set(COVERED)):
+        found, reason = wasmtime.told(path.read_bytes())
+        assert found is None
+        assert reason.startswith("this decoder does not know the "), path
+
+
+@needs_wasmtime
+def test_too_little_memory_is_told(wasmtime):
+    path = ROOT / "tests" / "golden" / "3dgs_classes_v1.swz"
+    assert wasmtime.told(path.read_bytes(), memory=3 << 19) == (None, "the decoder has no more memory")
+
+
+@needs_ziglang
+def test_a_build_here_gives_the_same_bytes():
+    subprocess.run([sys.executable, ROOT / "tools" / "build_decoder.py", "--check"], check=True)
