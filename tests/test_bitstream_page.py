@@ -13,6 +13,7 @@ import pytest
 import torch
 import zstandard
 from bitstream_page import container as page_container
+from bitstream_page import decoded_hash
 from bitstream_page import entropy_coders, entropy_models, method_files, positions
 from sw_reference.projection import rotation_matrices
 
@@ -56,6 +57,7 @@ def assert_page_agrees(path: Path) -> dict[str, np.ndarray]:
     for name, array in ours.items():
         assert (found[name].dtype, found[name].shape) == (array.dtype, array.shape), name
         assert found[name].tobytes() == array.tobytes(), name
+    assert decoded_hash.parameter_hash(found) == model.parameter_hash()
     return found
 
 
@@ -76,7 +78,7 @@ def test_the_reader_has_a_file_for_each_chapter_of_the_page():
     """But the last, which is about what a reader refuses."""
     chapters = re.findall(r"^## (\d [^(\n]+?)(?: \(.*| `.*)?$", PAGE.read_text(), re.MULTILINE)
     *described, refused = chapters
-    assert refused == "7 What a file may claim"
+    assert refused == "8 What a file may claim"
     opening = "\n".join(path.read_text().partition("\n")[0] for path in READER)
     for number, _, title in (chapter.partition(" ") for chapter in described):
         assert f"Chapter {number}: {title}" in opening

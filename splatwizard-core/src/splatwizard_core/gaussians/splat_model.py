@@ -101,7 +101,7 @@ class SplatModel(nn.Module):
         return sha.hexdigest()
 
     def parameter_hash(self) -> str:
-        """SHA-256 of the parameters alone, as decoders in any language compute it (docs/bitstream.md, chapter 8)."""
+        """SHA-256 of the parameters alone, as decoders in any language compute it (docs/bitstream.md, chapter 7)."""
         first = ["means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest"]  # then all others by name
         found = dict(self.named_parameters())
         names = sorted(found, key=lambda name: (first.index(name) if name in first else len(first), name))
