@@ -13,8 +13,7 @@ import pytest
 import torch
 import zstandard
 from bitstream_page import container as page_container
-from bitstream_page import decoded_hash
-from bitstream_page import entropy_coders, entropy_models, method_files, positions
+from bitstream_page import decoded_hash, entropy_coders, entropy_models, method_files, positions
 from sw_reference.projection import rotation_matrices
 
 from splatwizard_core.base import strict_json
