@@ -19,6 +19,7 @@ from types import SimpleNamespace
 import pytest
 import sw_view
 from headless_chromium import Chromium, find_chromium
+from sw_view.coded_file import covers
 
 from splatwizard_core.coding.container import ContainerReader
 from splatwizard_core.errors import BitstreamError
@@ -29,10 +30,7 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[3]
 FOLDER = Path(sw_view.__file__).parent / "splatwizard-decoder"
 GOLDEN = sorted((ROOT / "tests" / "golden").glob("*.swz"))
-LACKING = ("c3dgs", "cat_3dgs", "chimerags", "compact3dgs", "hac", "lightgaussian", "mesongs", "wisp")
-"""Beginnings of the names of golden files that the decoder does not know yet."""
-LACKING_CODECS = ("2dgs_ply_v1", "2dgs_zstd_v1", "trimming_the_fat_ply_v1", "trimming_the_fat_zstd_v1")
-COVERED = [path for path in GOLDEN if not path.stem.startswith(LACKING) and path.stem not in LACKING_CODECS]
+COVERED = [path for path in GOLDEN if covers(ContainerReader.open(path))]
 needs_wasmtime = pytest.mark.skipif(importlib.util.find_spec("wasmtime") is None, reason="wasmtime is not installed")
 needs_node = pytest.mark.skipif(shutil.which("node") is None, reason="Node is not installed")
 needs_ziglang = pytest.mark.skipif(importlib.util.find_spec("ziglang") is None, reason="ziglang is not installed")

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+import base64
 import html
 import json
 import re
 import shutil
 import subprocess
+import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import sw_view
 import torch
 from sw_gaussians.ply import export_ply
+from sw_view import coded_file
+from sw_view.coded_file import with_file
+from sw_view.packing import pack
 from sw_view.page_file import About, write_page
 
 from splatwizard_core.api import GaussianModel
 from splatwizard_core.cli.main import main
+from splatwizard_core.tooling import load_plugins, open_model
 
 GOLDEN = Path(__file__).parents[3] / "tests" / "golden"
 
@@ -157,3 +164,36 @@ def test_a_mean_at_the_end_of_float32_leaves_a_page_that_browsers_can_read(model
     text = (tmp_path / "far.html").read_text("utf-8")
     assert "NaN" not in re.findall(r'id="facts">(.*?)</script>', text)[0]
     assert facts_of(tmp_path / "far.html")["count"] == 38
+
+
+def of_file(name: str) -> GaussianModel:
+    model, _ = open_model(GOLDEN / f"{name}.swz", load_plugins(), torch.device("cpu"))
+    assert isinstance(model, GaussianModel)
+    return model
+
+
+def test_a_page_holds_the_file_where_that_is_smaller(monkeypatch):
+    model, data = of_file("3dgs_classes_v1"), (GOLDEN / "3dgs_classes_v1.swz").read_bytes()
+    packed = replace(pack(model), text="a" * 20_000)  # as if its Gaussians were no small family
+    monkeypatch.setattr(coded_file, "_decoder", lambda: "<script></script>")
+    assert base64.b64decode(with_file(model, packed).text) == data
+    assert with_file(model, packed).facts == {**packed.facts, "reach": packed.reach}
+    monkeypatch.setattr(coded_file, "_decoder", lambda: " " * 10_000)
+    assert with_file(model, packed) is packed
+
+
+@pytest.mark.parametrize("change", [{"world_origin": [1.0, 0.0, 0.0]}, {"file": "gone.swz"}, {"left_out": {"some": 1}}])
+def test_a_model_that_is_not_that_of_its_file_is_packed(monkeypatch, change):
+    model = of_file("3dgs_classes_v1")
+    model.origin = {**model.origin, **change}
+    packed = replace(pack(model), text="a" * 20_000)
+    monkeypatch.setattr(coded_file, "_decoder", lambda: "")
+    assert with_file(model, packed) is packed
+
+
+def test_the_decoder_in_the_page_is_the_module_that_is_shipped():
+    text = coded_file._decoder()
+    (module,) = re.findall(r'<script type="text/plain" id="wasm">(.*?)</script>', text)
+    assert zlib.decompress(base64.b64decode(module)) == (coded_file.FOLDER / "decoder.wasm").read_bytes()
+    assert text.count("</script>") == 2
+    assert "export " not in text

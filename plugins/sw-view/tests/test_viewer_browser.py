@@ -20,13 +20,14 @@ import pytest
 import torch
 from headless_chromium import WEBGL, Chromium, find_chromium
 from PIL import Image
+from sw_gaussians.surfels import gaussians_of
 from sw_view.entries import Opened, find_entries, open_entry
 from sw_view.page_file import About, write_page, write_pair
 from sw_view.shown_cameras import surroundings_of
 from sw_view.shown_models import shown_model
 
-from splatwizard_core.api import Camera, GaussianModel, RasterOptions, Scene, SceneOptions
-from splatwizard_core.tooling import Choices, NegotiatedRasterizer, load_plugins, load_scene, render_view
+from splatwizard_core.api import Camera, ContainerWriter, GaussianModel, RasterOptions, Scene, SceneOptions
+from splatwizard_core.tooling import Choices, NegotiatedRasterizer, load_plugins, load_scene, open_model, render_view
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(find_chromium() is None, reason="no Chromium is installed")]
 GOLDEN = Path(__file__).parents[3] / "tests" / "golden"
@@ -103,6 +104,43 @@ def test_the_page_shows_what_the_rasterizer_draws(browser, scene, model, tmp_pat
         assert psnr(shown, drawn(model, camera, options)) > 40
     assert browser.requests()[0].startswith(page.as_uri())
     assert all(url.startswith("blob:") for url in browser.requests()[1:])
+
+
+@pytest.fixture(scope="module", params=["3dgs", "2dgs"])
+def coded(request, scene, tmp_path_factory) -> GaussianModel:
+    """Gaussians, or surfels, that come from a quantized file; one of them lies too far away to be drawn."""
+    draw = torch.Generator().manual_seed(5)
+    plugins, n, axes = load_plugins(), 20_000, 3 if request.param == "3dgs" else 2
+    xyz = scene.points.xyz[torch.randint(len(scene.points.xyz), (n,), generator=draw)]
+    xyz = xyz + 0.05 * torch.randn(xyz.shape, generator=draw)
+    xyz[7] = 1e6
+    found = gaussians_of(
+        xyz, torch.randn(n, 1, 3, generator=draw), 0.1 * torch.randn(n, 15, 3, generator=draw),
+        2 * torch.randn(n, generator=draw), -3.2 + 0.9 * torch.randn(n, axes, generator=draw),
+        torch.randn(n, 4, generator=draw), active_sh_degree=2,
+    )  # fmt: skip
+    writer = ContainerWriter(request.param, 1)
+    writer.static["codec"] = "gaussians-quantized"
+    plugins.gaussian_codecs.load("gaussians-quantized")(plugins).encode(found, writer)
+    path = tmp_path_factory.mktemp("coded") / "scene.swz"
+    writer.write(path)
+    return open_model(path, plugins, torch.device("cpu"))[0]
+
+
+def test_a_page_that_holds_the_file_shows_what_one_of_packed_gaussians_shows(browser, scene, coded, tmp_path):
+    pages = [tmp_path / name for name in ("file.html", "packed.html")]
+    write_page(coded, pages[0], About("toy"), surroundings_of(scene))
+    coded.origin = {}
+    write_page(coded, pages[1], About("toy"), surroundings_of(scene))
+    assert ['id="decoder"' in page.read_text() for page in pages] == [True, False]
+    assert pages[0].stat().st_size < pages[1].stat().st_size
+    camera = scene.test[0].camera
+    pictures = []
+    for page in pages:
+        pictures.append(still(browser, page, 0, (camera.width, camera.height)))
+        assert all(url.startswith("blob:") for url in browser.requests()[1:])
+    assert psnr(*pictures) > 50  # places are exact in one of them
+    assert pictures[0].std() > 0.05
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2])

@@ -13,7 +13,7 @@ A Gaussian takes 19 bytes and 3 a coefficient of the bands above 0, before defla
 from __future__ import annotations
 
 import base64
-import math
+import sys
 import zlib
 from dataclasses import dataclass
 from typing import Any
@@ -38,14 +38,22 @@ FARTHEST = 1e4
 BRIGHTEST = 8.0
 """Least and largest 0.5 + SH_C0 dc are -8 and 8, of a coefficient, too: a wilder one would coarsen all others."""
 
+Reach = tuple[float, float, float, float]
+"""x, y, z of a middle, and how far from it along an axis Gaussians are kept."""
+
 
 @dataclass(frozen=True)
 class Packed:
-    """Gaussians for the page: their bytes as text, and the numbers that are needed to unpack them."""
+    """Gaussians for the page: their bytes as text, and the numbers that are needed to unpack them.
+
+    means       [n,3], of those that are kept
+    """
 
     text: str
     facts: dict[str, Any]
-    means: NDArray[np.float32]  # [n,3], of those that are kept
+    means: NDArray[np.float32]
+    reach: Reach
+    decoder: str = ""  # elements of the page with which `text` is a .swz (coded_file.py)
 
 
 def explicit(model: SplatModel) -> GaussianModel:
@@ -60,28 +68,31 @@ def explicit(model: SplatModel) -> GaussianModel:
 
 def solid_means(model: GaussianModel) -> NDArray[np.float32]:
     """Return the means [n,3] of the Gaussians that can be drawn: finite, not too faint, not too far."""
-    means: NDArray[np.float32] = model.means[_drawable(model)].detach().float().cpu().numpy()
+    means: NDArray[np.float32] = model.means[_drawable(model)[0]].detach().float().cpu().numpy()
     return means
 
 
 @torch.no_grad()
-def _drawable(model: GaussianModel) -> torch.Tensor:
+def _drawable(model: GaussianModel) -> tuple[torch.Tensor, Reach]:
+    """Return which Gaussians can be drawn, and how far from which middle those are."""
     keep = torch.sigmoid(model.opacity_logits) >= FAINTEST
     for value in (getattr(model, name) for name in model.RAW):
         keep &= torch.isfinite(value).flatten(1).all(dim=1) if value.dim() > 1 else torch.isfinite(value)
     kept = torch.nonzero(keep)[:, 0]
-    keep[kept[~_near(model.means[kept])]] = False
-    return keep
+    places = model.means[kept].detach().double().cpu().numpy()
+    *middle, reach = found = _reach(places)
+    near = (np.abs(places - middle) <= reach).all(axis=1)
+    keep[kept[torch.from_numpy(~near).to(kept.device)]] = False
+    return keep, found
 
 
-def _near(means: torch.Tensor) -> torch.Tensor:
-    """Return whether each of the means [N,3] is at most `FARTHEST` from the median; where half are one, all are."""
-    if not len(means):
-        return torch.ones(0, dtype=torch.bool, device=means.device)
-    places = means.detach().double().cpu().numpy()
+def _reach(places: NDArray[np.float64]) -> Reach:
+    """Return the median of places [N,3] and `FARTHEST` widths of the middle half; where half are one, all are near."""
+    if not len(places):
+        return 0.0, 0.0, 0.0, sys.float_info.max
     low, middle, high = np.percentile(places, (25, 50, 75), axis=0)
-    width = float((high - low).max()) or math.inf
-    return torch.from_numpy((np.abs(places - middle) <= FARTHEST * width).all(axis=1)).to(means.device)
+    x, y, z = middle.tolist()
+    return x, y, z, FARTHEST * float((high - low).max()) or sys.float_info.max
 
 
 def pack(model: SplatModel) -> Packed:
@@ -91,7 +102,7 @@ def pack(model: SplatModel) -> Packed:
     """
     found = explicit(model)
     with torch.no_grad():
-        keep = _drawable(found)
+        keep, reach = _drawable(found)
         means, logits, log_scales, quats = (
             getattr(found, name)[keep].detach().float().cpu().numpy()
             for name in ("means", "opacity_logits", "log_scales", "quats")
@@ -113,7 +124,7 @@ def pack(model: SplatModel) -> Packed:
         "count": len(means), "chunk": CHUNK, "degree": found.active_sh_degree,
         "scales": scale_range, "colors": color_range, "bands": steps,
     }  # fmt: skip
-    return Packed(base64.b64encode(packed).decode("ascii"), facts, means[order])
+    return Packed(base64.b64encode(packed).decode("ascii"), facts, means[order], reach)
 
 
 def morton_order(means: NDArray[np.float32]) -> NDArray[np.int64]:

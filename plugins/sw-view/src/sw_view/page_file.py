@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from sw_gaussians.render_options import antialias_of, eps2d_of
 
 from splatwizard_core.api import Camera, SplatModel, replacing
-from sw_view.packing import pack
+from sw_view.coded_file import with_file
+from sw_view.packing import Packed, pack
 from sw_view.shown_cameras import NamedCamera, Surroundings, surroundings_about
 
 SCRIPTS = ("data.js", "renderer.js", "camera.js", "main.js")
@@ -57,8 +58,8 @@ def write_page(model: SplatModel, path: str | os.PathLike[str], about: About, ar
     around  cameras to look from; None: made up around the Gaussians
     Raises SceneError for a model whose Gaussians depend on the camera, or that has none.
     """
-    packed = pack(model)
-    text = _page(packed.text, packed.facts, about, around or surroundings_about(packed.means))
+    packed = with_file(model, pack(model))
+    text = _page(packed, about, around or surroundings_about(packed.means))
     with replacing(path) as temporary:
         Path(temporary).write_text(text, encoding="utf-8")
 
@@ -73,9 +74,9 @@ def write_pair(
     """
     frames = []
     for model, about in models:
-        packed = pack(model)
+        packed = with_file(model, pack(model))
         around = around or surroundings_about(packed.means)
-        page = html.escape(_page(packed.text, packed.facts, about, around))
+        page = html.escape(_page(packed, about, around))
         frames.append(f'<iframe title="{html.escape(about.title)}" srcdoc="{page}"></iframe>\n')
     parts = {"TITLE": html.escape(" | ".join(about.title for _, about in models)), "FRAMES": "".join(frames)}
     pieces = _text("pair.html").split("@TITLE@")
@@ -90,14 +91,14 @@ def export_page(model: SplatModel, path: str | os.PathLike[str]) -> None:
     write_page(model, path, about, None)
 
 
-def _page(gaussians: str, packed: dict[str, Any], about: About, around: Surroundings) -> str:
+def _page(packed: Packed, about: About, around: Surroundings) -> str:
     facts = {
-        **packed,
+        **packed.facts,
         "background": about.background, "eps2d": about.eps2d, "antialias": int(about.antialias),
         "near": around.cameras[0].camera.near, "up": _numbers(around.up), "pivot": _numbers(around.pivot),
         "size": around.size, "cameras": [_camera(each) for each in around.cameras],
     }  # fmt: skip
-    told = [f"{packed['count']:,} Gaussians"]
+    told = [f"{packed.facts['count']:,} Gaussians"]
     told += [] if about.method is None else [about.method]
     told += [] if about.size is None else [f"{about.size:,} bytes encoded"]
     parts = {
@@ -110,7 +111,8 @@ def _page(gaussians: str, packed: dict[str, Any], about: About, around: Surround
         "FRAGMENT": _text("splat.frag"),
         "WORKER": _text("sort.js"),
         "SCRIPT": "".join(_text(name) for name in SCRIPTS),
-        "GAUSSIANS": gaussians,
+        "GAUSSIANS": packed.text,
+        "DECODER": packed.decoder,
     }
     # In one pass: what is put in is not looked at again.
     pieces = _text("page.html").split("@")

@@ -1,9 +1,25 @@
 // From the text in the page to what the GPU reads. The layout is that of sw_view/packing.py.
-async function unpacked(text) {
+function bytesFrom(text) {
   const binary = atob(text.trim()), bytes = new Uint8Array(binary.length);
   for (let i = 0; i < binary.length; i++) bytes[i] = binary.charCodeAt(i);
-  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream('deflate'));
+  return bytes;
+}
+
+async function unpacked(text) {
+  const stream = new Blob([bytesFrom(text)]).stream().pipeThrough(new DecompressionStream('deflate'));
   return new Response(stream).arrayBuffer();
+}
+
+// What the page holds: the encoded file and its decoder (coded.js), or Gaussians as they are drawn.
+async function gaussiansOf(text, decoder, wasm, facts) {
+  if (!decoder) return gaussiansFrom(await unpacked(text), facts);
+  const worker = new Worker(URL.createObjectURL(new Blob([decoder.textContent], { type: 'text/javascript' })));
+  const module = await unpacked(wasm.textContent);
+  return new Promise((resolve, reject) => {
+    worker.onerror = reject;
+    worker.onmessage = ({ data: { found, failure } }) => { if (found) resolve(found); else reject(new Error(failure)); };
+    worker.postMessage({ wasm: module, file: bytesFrom(text), facts });
+  }).finally(() => worker.terminate());
 }
 
 function gaussiansFrom(buffer, facts) {

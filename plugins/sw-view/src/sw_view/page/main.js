@@ -13,8 +13,8 @@ function fail(error) {
 
 async function begin() {
   const canvas = find('canvas');
-  const gaussians = gaussiansFrom(await unpacked(find('gaussians').textContent), facts);
-  find('gaussians').remove();
+  const gaussians = await gaussiansOf(find('gaussians').textContent, find('decoder'), find('wasm'), facts);
+  for (const id of ['gaussians', 'decoder', 'wasm']) find(id)?.remove();
   const sources = { vertex: find('vertex').textContent.trim(), fragment: find('fragment').textContent.trim() };
   const renderer = new Renderer(canvas, gaussians, facts, sources, still);
   const worker = new Worker(URL.createObjectURL(new Blob([find('worker').textContent], { type: 'text/javascript' })));
