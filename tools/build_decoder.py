@@ -30,7 +30,7 @@ ZIGLANG = "0.17.1"
 MOST_MEMORY = 1 << 30
 STACK = 1 << 19
 FLAGS = (
-    "-target", "wasm32-wasi", "-mexec-model=reactor", "-std=c++20", "-O2", "-msimd128", "-ffp-contract=off",
+    "-target", "wasm32-wasi", "-mexec-model=reactor", "-std=c++20", "-Os", "-msimd128", "-ffp-contract=off",
     "-fno-rtti", "-s", "-DSW_ARCH=arch_native", f"-Wl,--max-memory={MOST_MEMORY}", f"-Wl,-z,stack-size={STACK}",
     "-isystem", str(SHARED), "-I", str(KERNELS),
 )  # fmt: skip

@@ -106,22 +106,24 @@ def test_the_page_shows_what_the_rasterizer_draws(browser, scene, model, tmp_pat
     assert all(url.startswith("blob:") for url in browser.requests()[1:])
 
 
-@pytest.fixture(scope="module", params=["3dgs", "2dgs"])
+@pytest.fixture(scope="module", params=["3dgs", "2dgs", "mesongs"])
 def coded(request, scene, tmp_path_factory) -> GaussianModel:
-    """Gaussians, or surfels, that come from a quantized file; one of them lies too far away to be drawn."""
+    """Gaussians, or surfels, that come from a file; one of them lies too far away to be drawn."""
     draw = torch.Generator().manual_seed(5)
-    plugins, n, axes = load_plugins(), 20_000, 3 if request.param == "3dgs" else 2
+    method, plugins, n = request.param, load_plugins(), 20_000
+    codec, settings = ("raht", {"vq_steps": 1}) if method == "mesongs" else ("gaussians-quantized", {})
+    axes = 2 if method == "2dgs" else 3
     xyz = scene.points.xyz[torch.randint(len(scene.points.xyz), (n,), generator=draw)]
     xyz = xyz + 0.05 * torch.randn(xyz.shape, generator=draw)
-    xyz[7] = 1e6
+    xyz[7] = 0 if method == "mesongs" else 1e6  # its voxels would all be one
     found = gaussians_of(
         xyz, torch.randn(n, 1, 3, generator=draw), 0.1 * torch.randn(n, 15, 3, generator=draw),
         2 * torch.randn(n, generator=draw), -3.2 + 0.9 * torch.randn(n, axes, generator=draw),
         torch.randn(n, 4, generator=draw), active_sh_degree=2,
     )  # fmt: skip
-    writer = ContainerWriter(request.param, 1)
-    writer.static["codec"] = "gaussians-quantized"
-    plugins.gaussian_codecs.load("gaussians-quantized")(plugins).encode(found, writer)
+    writer = ContainerWriter(method, 1)
+    writer.static["codec"] = codec
+    plugins.gaussian_codecs.load(codec)(plugins, **settings).encode(found, writer)
     path = tmp_path_factory.mktemp("coded") / "scene.swz"
     writer.write(path)
     return open_model(path, plugins, torch.device("cpu"))[0]

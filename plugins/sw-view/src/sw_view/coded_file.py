@@ -18,25 +18,36 @@ FOLDER = Path(str(files("sw_view"))) / "splatwizard-decoder"
 
 METHODS = (
     "3dgs", "pruned-3dgs", "trimming-the-fat", "pup-3dgs", "speedy-splat", "lightgaussian", "2dgs", "flat-3dgs",
-    "trim-3dgs", "trim-2dgs", "trim-2dgs-scratch",
+    "trim-3dgs", "trim-2dgs", "trim-2dgs-scratch", "c3dgs", "mesongs",
 )  # fmt: skip
 """Methods whose files the decoder knows (source/decode.cpp), where they are in one of CODECS."""
-CODECS = ("gaussians-exact", "gaussians-quantized")
+CODECS = (
+    "gaussians-exact", "gaussians-quantized", "gaussians-zstd", "gaussians-ply", "vectree", "gaussians-indexed", "raht",
+)  # fmt: skip
 MODES = ("exact", "quantized")
 """Of `3dgs`, in place of a codec."""
+PARTS = {
+    "entropy": ("columns",), "positions": ("octree",), "means": ("float-delta",), "arrays": ("byte-planes", "deflate"),
+    "vq": ("importance-vq",),
+}  # fmt: skip
+"""Header value -> what it may name: a file may ask for parts of others, which the decoder lacks."""
+VECTORS = ("vq", "sh2/vq/header", "sh3/vq/header")
+"""Sections whose first byte is 2 if their parts are those of others."""
 
 
 def covers(reader: ContainerReader) -> bool:
     """Return whether the WebAssembly decoder knows a file."""
-    if (
-        reader.method not in METHODS
-        or reader.version != 1
-        or "entropy" in reader.static
-        or "positions" in reader.static
-    ):
+    static = reader.static
+    if reader.version != 1 or any(static.get(part, names[0]) not in names for part, names in PARTS.items()):
         return False
-    codec, mode = reader.static.get("codec"), reader.static.get("mode")
-    return codec in CODECS or (codec is None and reader.method == "3dgs" and mode in MODES)
+    if any(reader.section(name)[:1] != b"\1" for name in VECTORS if name in reader):
+        return False
+    if reader.method == "chimerags":
+        return True
+    codec, mode = static.get("codec"), static.get("mode")
+    return reader.method in METHODS and (
+        codec in CODECS or (codec is None and reader.method == "3dgs" and mode in MODES)
+    )
 
 
 def with_file(model: SplatModel, packed: Packed) -> Packed:

@@ -50,7 +50,7 @@ function forGpu(arrays, facts) {
 
 self.onmessage = async ({ data: { wasm, file, facts } }) => {
   try {
-    const found = forGpu(parameters(await WebAssembly.compile(wasm), file).arrays, facts);
+    const found = forGpu(plain(parameters(await WebAssembly.compile(wasm), file).arrays), facts);
     self.postMessage({ found }, [found.means.buffer, found.words.buffer, found.harmonics.buffer]);
   } catch (error) {
     self.postMessage({ failure: error.message });

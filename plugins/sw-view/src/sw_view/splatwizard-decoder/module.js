@@ -44,21 +44,48 @@ export function parameters(module, bytes, { hash = false } = {}) {
     if (!(error instanceof WebAssembly.RuntimeError)) throw error;
     throw new DecodeError(text(exports.swz_refusal()) || `the decoder failed: ${error.message}`);
   }
-  const FIELDS = 7, arrays = {};  // pointers to name and values, number of axes, four lengths
+  const FIELDS = 8, arrays = {};  // pointers to name and values, whether it is an index, number of axes, four lengths
   const fields = new Uint32Array(exports.memory.buffer, exports.swz_arrays(), FIELDS * exports.swz_count());
   for (let i = 0; i < fields.length; i += FIELDS) {
-    const shape = [...fields.subarray(i + 3, i + 3 + fields[i + 2])];
-    const size = shape.reduce((a, b) => a * b, 1);
-    arrays[text(fields[i])] = { shape, data: new Float32Array(exports.memory.buffer, fields[i + 1], size).slice() };
+    const shape = [...fields.subarray(i + 4, i + 4 + fields[i + 3])], size = shape.reduce((a, b) => a * b, 1);
+    const Values = fields[i + 2] ? Uint32Array : Float32Array;
+    arrays[text(fields[i])] = { shape, data: new Values(exports.memory.buffer, fields[i + 1], size).slice() };
   }
   return { arrays, hash: hash ? text(exports.swz_hash()) : null };
+}
+
+// A row of `of` for each Gaussian, by its index.
+function gathered({ shape: [, ...rest], data }, { data: index }) {
+  const width = rest.reduce((a, b) => a * b, 1), found = new Float32Array(width * index.length);
+  index.forEach((row, i) => found.set(data.subarray(width * row, width * (row + 1)), width * i));
+  return { shape: [index.length, ...rest], data: found };
+}
+
+const LOGIT_MARGIN = 1e-6, SMALLEST_SCALE = 1e-9;  // as the Python package makes plain Gaussians of shared ones
+
+/** Raw parameters of plain Gaussians, of whatever `parameters` gave: codebooks are gathered. */
+export function plain(arrays) {
+  if (arrays.sh_dc) return arrays;
+  const { means, color_dc, color_rest, color_index, log_factors, opacity_values, shape_scales, shape_quats, shape_index } = arrays;
+  const logit = x => Math.log(x / (1 - x)), log_scales = gathered(shape_scales, shape_index);
+  log_scales.data.forEach((scale, k) => {
+    log_scales.data[k] = Math.log(Math.max(SMALLEST_SCALE, Math.exp(log_factors.data[Math.floor(k / 3)]) * scale));
+  });
+  return {
+    means, log_scales, quats: gathered(shape_quats, shape_index),
+    opacity_logits: {
+      shape: opacity_values.shape,
+      data: opacity_values.data.map(x => logit(Math.min(1 - LOGIT_MARGIN, Math.max(LOGIT_MARGIN, x)))),
+    },
+    sh_dc: gathered(color_dc, color_index), sh_rest: gathered(color_rest, color_index),
+  };
 }
 
 const SURFEL_THICKNESS = 1e-8;  // world units, as `sw export` gives surfels a third axis
 
 /** Gaussians as a renderer wants them, of what `parameters` gave. */
 export function gaussians(bytes, { arrays, hash }) {
-  const { means, log_scales, quats, opacity_logits, sh_dc, sh_rest } = arrays;
+  const { means, log_scales, quats, opacity_logits, sh_dc, sh_rest } = plain(arrays);
   const count = means.shape[0], rest = 3 * sh_rest.shape[1], axes = log_scales.shape[1];
   const scales = new Float32Array(3 * count).fill(SURFEL_THICKNESS), sh = new Float32Array((3 + rest) * count);
   for (let i = 0; i < count; i++) {

@@ -3,7 +3,26 @@
 namespace swz {
 
 Text refusal;
-const char* blamed = nullptr;
+const char *blamed = nullptr, *part = nullptr, *cut = nullptr;
+
+void begin_refusal() {
+  refusal.size = 0;
+  if (blamed != nullptr) {
+    refusal.put("section '");
+    refusal.put(blamed);
+    refusal.put("': ");
+  }
+  if (part != nullptr) {
+    refusal.put("part '");
+    refusal.put(part);
+    refusal.put("': ");
+  }
+}
+
+void Bytes::refuse_to_take(int64_t count) const {
+  if (cut != nullptr) refuse(cut);
+  refuse(grouped(count), " bytes are needed, ", grouped(left), " are left: the data is truncated");
+}
 
 void Text::put(int64_t value, bool grouped) {
   char digits[32];
@@ -77,7 +96,7 @@ uint64_t Bytes::varint(uint64_t limit) {
 // What the kernels throw when memory runs out ends the decoding too.
 extern "C" {
 void* __cxa_allocate_exception(size_t) noexcept {
-  swz::blamed = nullptr;
+  swz::blamed = swz::part = nullptr;
   swz::refuse("the decoder has no more memory");
 }
 void __cxa_throw(void*, void*, void (*)(void*)) { __builtin_trap(); }

@@ -36,25 +36,24 @@ inline void put(Text& text, Grouped part) { text.put(part.value, true); }
 
 extern Text refusal;
 extern const char* blamed;  // the section that is being decoded; null: the file or its header
+extern const char* part;    // what of it; null: all
+extern const char* cut;     // what it means that bytes run out; null: that is said as it is
+
+void begin_refusal();  // with what is blamed
 
 // Ends the decoding with a reason in the words of the Python reader.
 template <class... Parts>
-[[noreturn]] void refuse(Parts... parts) {
-  refusal.size = 0;
-  if (blamed != nullptr) {
-    refusal.put("section '");
-    refusal.put(blamed);
-    refusal.put("': ");
-  }
+[[noreturn, gnu::cold, gnu::noinline]] void refuse(Parts... parts) {
+  begin_refusal();
   (put(refusal, parts), ...);
   __builtin_trap();
 }
 
-// Blames what goes wrong during its life on a section.
+// Blames what goes wrong during its life on a section, or on a part of it.
 struct Blame {
-  const char* before = blamed;
-  explicit Blame(const char* section) { blamed = section; }
-  ~Blame() { blamed = before; }
+  const char *before = blamed, *part_before = part;
+  explicit Blame(const char* section, const char* of = nullptr) { blamed = section, part = of; }
+  ~Blame() { blamed = before, part = part_before; }
   Blame(const Blame&) = delete;
 };
 
@@ -69,7 +68,7 @@ struct Buffer {
     const auto most = static_cast<int64_t>(INT32_MAX / sizeof(T));
     data = count > most ? nullptr : static_cast<T*>(std::malloc(sizeof(T) * static_cast<size_t>(count > 0 ? count : 1)));
     if (data == nullptr) {
-      blamed = nullptr;
+      blamed = part = nullptr;
       refuse("the decoder has no more memory");
     }
   }
@@ -107,8 +106,7 @@ struct Bytes {
   int64_t left = 0;
 
   Bytes take(int64_t count) {
-    if (count < 0 || count > left)
-      refuse(grouped(count), " bytes are needed, ", grouped(left), " are left: the data is truncated");
+    if (count < 0 || count > left) refuse_to_take(count);
     const Bytes taken{data, count};
     data += count;
     left -= count;
@@ -126,6 +124,7 @@ struct Bytes {
   void finish() const {
     if (left) refuse(grouped(left), " unknown bytes at the end");
   }
+  [[noreturn]] void refuse_to_take(int64_t count) const;
 };
 
 // Integers of a fixed number of bits, each from its least significant bit up.

@@ -102,22 +102,45 @@ Bytes Container::section(const char* name) {
   refuse("is missing");
 }
 
-Bytes Container::array(const char* name, int64_t first, int64_t second, int64_t third) {
+bool Container::has(const char* name) const {
+  for (int64_t i = 0; i < count; ++i)
+    if (std::strcmp(sections[i].name, name) == 0) return true;
+  return false;
+}
+
+Bytes Container::array(const char* name, Dtype dtype, int64_t first, int64_t second, int64_t third) {
+  static constexpr const char* NAMES[] = {"", "uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64",
+                                          "float16", "float32", "float64", "bool"};
+  static constexpr uint8_t SIZES[] = {0, 1, 1, 2, 2, 4, 4, 8, 8, 2, 4, 8, 1};
   Bytes data = section(name);
   const Blame blame(name);
-  const int64_t wanted[] = {first, second, third};
-  const int axes = third >= 0 ? 3 : second >= 0 ? 2 : 1;
+  const int64_t wanted[] = {first, second, third}, axes = third >= 0 ? 3 : second >= 0 ? 2 : 1;
   if (data.left < 2) refuse(data.left, " bytes cannot hold an array header");
-  const auto code = data.integer(1), found = data.integer(1);
-  if (code != 10) refuse("dtype is not float32");
-  if (static_cast<int>(found) != axes) refuse("the array has ", static_cast<int64_t>(found), " axes, must have ", axes);
-  int64_t bytes = 4;
-  for (int i = 0; i < axes; ++i) {
-    const auto length = static_cast<int64_t>(data.integer(4));
-    if (length != wanted[i]) refuse("axis ", i, " of the array has length ", length, ", must be ", wanted[i]);
-    bytes *= length;  // below 2^32 times 48
+  const auto code = data.integer(1);
+  const auto found = static_cast<int64_t>(data.integer(1));
+  if (code < 1 || code > 12) refuse("unknown dtype code ", static_cast<int64_t>(code));
+  if (found > 8) refuse(found, " axes, at most 8 are allowed");
+  if (data.left < 4 * found) refuse(data.left + 2, " bytes cannot hold the header of an array with ", found, " axes");
+  int64_t shape[8];
+  double bytes = SIZES[code];
+  Text listed, must;
+  for (int64_t i = 0; i < found; ++i) {
+    shape[i] = static_cast<int64_t>(data.integer(4));
+    bytes *= static_cast<double>(shape[i]);
+    if (i) listed.put(", ");
+    listed.put(shape[i]);
   }
-  if (data.left != bytes) refuse(grouped(data.left), " bytes of values, the shape needs ", grouped(bytes));
+  bool same = found == axes;
+  for (int64_t i = 0; i < axes; ++i) {
+    same = same && shape[i] == wanted[i];
+    if (i) must.put(", ");
+    must.put(wanted[i]);
+  }
+  if (static_cast<double>(data.left) != bytes)
+    refuse(grouped(data.left), " bytes of values, shape [", listed.data, "] of ", NAMES[code], " needs ",
+           grouped(static_cast<int64_t>(bytes)));
+  if (code != dtype) refuse("dtype is ", NAMES[code], ", must be ", NAMES[dtype]);
+  if (!same) refuse("shape is [", listed.data, "], must be [", must.data, "]");
   return data;
 }
 
@@ -128,6 +151,12 @@ int64_t Container::integer(const char* key, int64_t low, int64_t high) const {
   if (found == nullptr || found->kind != Json::INTEGER || found->integer < low || found->integer > high)
     refuse("header value '", key, "' must be an integer in ", low, "..", high);
   return found->integer;
+}
+
+void Container::usual(const char* part, const char* name) const {
+  const Json* found = value(part);
+  if (found != nullptr && !found->is(name))
+    refuse("the file asks for ", part, " '", found->text, "', which this decoder lacks");
 }
 
 void Container::allow(int64_t decoded, int64_t gaussians) const {

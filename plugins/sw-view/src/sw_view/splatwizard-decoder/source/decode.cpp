@@ -14,36 +14,44 @@ namespace {
 Buffer<uint8_t> input;
 char hash[65];
 
-bool is_one_of(const Json& method, const char* const* names, int count) {
-  for (int i = 0; i < count; ++i)
-    if (method.is(names[i])) return true;
-  return false;
-}
-
 // Methods whose result is a set of Gaussians that a codec wrote.
-constexpr const char* BY_A_CODEC[] = {"pruned-3dgs", "trimming-the-fat", "pup-3dgs", "speedy-splat", "lightgaussian",
-                                      "2dgs", "flat-3dgs", "trim-3dgs", "trim-2dgs", "trim-2dgs-scratch"};
+constexpr const char* BY_A_CODEC[] = {"3dgs", "pruned-3dgs", "trimming-the-fat", "pup-3dgs", "speedy-splat",
+                                      "lightgaussian", "2dgs", "flat-3dgs", "trim-3dgs", "trim-2dgs",
+                                      "trim-2dgs-scratch", "c3dgs", "mesongs"};
+
+struct Codec {
+  const char* name;
+  void (*decode)(Container& file);
+};
+constexpr Codec CODECS[] = {{"gaussians-exact", decode_exact}, {"gaussians-quantized", decode_quantized},
+                            {"gaussians-zstd", decode_lossless}, {"gaussians-ply", decode_ply},
+                            {"vectree", decode_vectree}, {"gaussians-indexed", decode_indexed}, {"raht", decode_raht}};
 
 [[noreturn]] void lacks(const char* what, const Json* name) {
   refuse("this decoder does not know the ", what, " '", name != nullptr ? name->text : "", "'");
 }
 
-void decode(Container& file) {
-  const bool is_3dgs = file.method->is("3dgs");
-  if (!is_3dgs && !is_one_of(*file.method, BY_A_CODEC, sizeof(BY_A_CODEC) / sizeof(*BY_A_CODEC)))
-    lacks("method", file.method);
-  if (file.version != 1) refuse("version ", file.version, " of the layout of '", file.method->text, "' is not known");
+// Without a codec a file of 3dgs states its mode.
+void (*decoder_of(const Container& file))(Container& file) {
+  if (file.method->is("chimerags")) return decode_chimera;
+  bool by_a_codec = false;
+  for (const char* method : BY_A_CODEC) by_a_codec |= file.method->is(method);
+  if (!by_a_codec) lacks("method", file.method);
   const Json *codec = file.value("codec"), *mode = file.value("mode");
-  if (codec == nullptr && is_3dgs && mode != nullptr && (mode->is("exact") || mode->is("quantized")))
-    mode->is("exact") ? decode_exact(file) : decode_quantized(file);
-  else if (codec == nullptr)
+  if (codec == nullptr && file.method->is("3dgs") && mode != nullptr) {
+    if (mode->is("exact")) return decode_exact;
+    if (mode->is("quantized")) return decode_quantized;
     lacks("mode", mode);
-  else if (codec->is("gaussians-exact"))
-    decode_exact(file);
-  else if (codec->is("gaussians-quantized"))
-    decode_quantized(file);
-  else
-    lacks("codec", codec);
+  }
+  for (const Codec& each : CODECS)
+    if (codec != nullptr && codec->is(each.name)) return each.decode;
+  lacks("codec", codec);
+}
+
+void decode(Container& file) {
+  const auto decoder = decoder_of(file);
+  if (file.version != 1) refuse("version ", file.version, " of the layout of '", file.method->text, "' is not known");
+  decoder(file);
   file.finish();
 }
 
@@ -61,7 +69,8 @@ EXPORT(swz_decode) void swz_decode() {
 
 EXPORT(swz_refusal) const char* swz_refusal() { return refusal.data; }
 
-// Arrays of the model, `swz_count` of them: pointers to name and values, number of axes and four lengths, u32 each.
+// Arrays of the model, `swz_count` of them: pointers to name and values, whether it is an index, number of axes
+// and four lengths, u32 each.
 EXPORT(swz_arrays) const Array* swz_arrays() { return decoded.arrays; }
 EXPORT(swz_count) int32_t swz_count() { return decoded.count; }
 
@@ -69,6 +78,7 @@ EXPORT(swz_count) int32_t swz_count() { return decoded.count; }
 EXPORT(swz_hash) const char* swz_hash() {
   Sha256 sha;
   for (int i = 0; i < decoded.count; ++i) {
+    if (decoded.arrays[i].is_index) continue;
     int64_t size = 4;
     for (int axis = 0; axis < decoded.arrays[i].axes; ++axis) size *= decoded.arrays[i].shape[axis];
     sha.put(decoded.arrays[i].data, size);

@@ -6,7 +6,7 @@ Model3D decoded;
 
 float* Model3D::add(const char* name, int64_t first, int64_t second, int64_t third) {
   Array& array = arrays[count++];
-  array = {name, nullptr, 0, {}};
+  array = {name, nullptr, 0, 0, {}};
   int64_t size = 1;
   for (const int64_t length : {first, second, third}) {
     if (length < 0) break;
@@ -17,15 +17,23 @@ float* Model3D::add(const char* name, int64_t first, int64_t second, int64_t thi
   values.clear();
   array.data = values.data;
   values.data = nullptr;  // it stays as long as the instance
-  return array.data;
+  return static_cast<float*>(array.data);
+}
+
+uint32_t* Model3D::add_index(const char* name, int64_t length) {
+  auto* values = reinterpret_cast<uint32_t*>(add(name, length));
+  arrays[count - 1].is_index = 1;
+  return values;
 }
 
 void Model3D::check_finite() const {
   for (int i = 0; i < count; ++i) {
+    if (arrays[i].is_index) continue;
+    const auto* data = static_cast<const float*>(arrays[i].data);
     int64_t size = 1;
     for (int axis = 0; axis < arrays[i].axes; ++axis) size *= arrays[i].shape[axis];
     for (int64_t k = 0; k < size; ++k)
-      if (!__builtin_isfinite(arrays[i].data[k]))
+      if (!__builtin_isfinite(data[k]))
         refuse("decoded '", arrays[i].name, "' is not finite: the file is damaged or hostile");
   }
 }

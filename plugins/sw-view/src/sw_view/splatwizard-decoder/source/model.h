@@ -9,7 +9,8 @@ constexpr int MAX_ARRAYS = 32;
 // As the host reads it: 32-bit fields.
 struct Array {
   const char* name;
-  float* data;
+  void* data;
+  int32_t is_index;  // 0: float32, part of the hash; 1: uint32, which rows of other arrays a Gaussian takes
   int32_t axes;
   uint32_t shape[4];
 };
@@ -20,6 +21,7 @@ struct Model3D {
 
   // A new array [first, ...] of zeros; an axis of -1 is none.
   float* add(const char* name, int64_t first, int64_t second = -1, int64_t third = -1);
+  uint32_t* add_index(const char* name, int64_t length);
   // Refuses numbers that are not finite.
   void check_finite() const;
 };
@@ -32,6 +34,15 @@ struct Gaussians {
   int64_t count, rest;
 
   Gaussians(int64_t gaussians, int64_t sh_degree, int64_t scales);
+
+  // Coefficients of band 0, then the others of red, of green, of blue, as SH of one Gaussian.
+  void put_sh(int64_t gaussian, const float* coefficients, int64_t others) const {
+    for (int64_t color = 0; color < 3; ++color) {
+      sh_dc[3 * gaussian + color] = coefficients[color];
+      for (int64_t k = 0; k < others; ++k)
+        sh_rest[3 * (rest * gaussian + k) + color] = coefficients[3 + others * color + k];
+    }
+  }
 };
 
 }  // namespace swz

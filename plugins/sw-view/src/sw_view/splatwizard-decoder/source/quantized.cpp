@@ -97,9 +97,8 @@ Layout layout_of(const Container& file) {
     if (std::none_of(BESIDE, std::end(BESIDE), same) && std::none_of(KEYS, std::end(KEYS), same))
       wrong(key->key, "Extra inputs are not permitted");
   }
-  for (const char* part : {"entropy", "positions"})
-    if (const Json* name = file.value(part); name != nullptr)
-      refuse("the file asks for ", part, " '", name->text, "', which this decoder lacks");
+  file.usual("entropy", "columns");
+  file.usual("positions", "octree");
   if (found.active > found.degree) refuse("header activates more SH bands than there are");
   for (int axis = 0; axis < 3; ++axis)
     if (!(found.width[axis] > 0 && found.width[axis] < 1e30 && found.top[axis] >= 1 && found.top[axis] <= 40))
