@@ -63,6 +63,7 @@ test-wheels: $(VENV)/.ready-dev
 # Needs node 20 or newer and a Chromium for the tests of those; they skip without.
 test-wasm: $(VENV)/.ready-dev
 	$(PIP) install -q ziglang==0.17.1 wasmtime==50.0.1
+	npm install --silent --prefix build/three three@0.180.0 || true
 	$(BIN)/python -m pytest -m slow plugins/sw-view/tests/test_decoder.py $(PYTEST_ARGS)
 
 docs-site: $(VENV)/.ready-dev

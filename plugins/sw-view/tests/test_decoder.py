@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import http.server
 import importlib.util
@@ -14,6 +15,8 @@ import shutil
 import subprocess
 import sys
 import threading
+import time
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,7 +24,8 @@ import numpy as np
 import pytest
 import sw_view
 import torch
-from headless_chromium import Chromium, find_chromium
+from headless_chromium import WEBGL, Chromium, find_chromium
+from PIL import Image
 from sw_gaussians.surfels import as_ellipsoids
 from sw_view.coded_file import covers
 
@@ -32,6 +36,7 @@ from splatwizard_core.runs.decode import decode_model
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[3]
+THREE = ROOT / "build" / "three" / "node_modules"
 FOLDER = Path(sw_view.__file__).parent / "splatwizard-decoder"
 GOLDEN = sorted((ROOT / "tests" / "golden").glob("*.swz"))
 COVERED = [path for path in GOLDEN if covers(ContainerReader.open(path))]
@@ -153,35 +158,65 @@ def test_javascript_gets_the_gaussians_of_the_python_decoder(tmp_path):
         np.testing.assert_allclose(np.fromfile(tmp_path / path.name, "<f4"), wanted, rtol=3e-6, atol=1e-6)
 
 
-@needs_chromium
-def test_chromium_gives_the_hashes_of_the_python_decoder(tmp_path):
-    """In a worker, from the folder as it is published, over HTTP."""
-    (tmp_path / "package").symlink_to(FOLDER)
-    (tmp_path / "golden").symlink_to(GOLDEN[0].parent)
-    (tmp_path / "page.html").write_text("<!doctype html><title>decoder</title>")
-    handler = functools.partial(Quiet, directory=tmp_path)
+@contextlib.contextmanager
+def served(folder: Path) -> Iterator[str]:
+    """The package as it is published, the golden files and an empty page over HTTP; the address."""
+    shutil.copytree(FOLDER, folder / "package")
+    (folder / "golden").symlink_to(GOLDEN[0].parent)
+    (folder / "page.html").write_text("<!doctype html><title>decoder</title><link rel=icon href='data:,'>")
+    handler = functools.partial(Quiet, directory=folder)
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        browser = Chromium(find_chromium(), tmp_path / "profile")
-        try:
-            address = f"http://127.0.0.1:{server.server_address[1]}/page.html"
-            browser.open(SimpleNamespace(resolve=lambda: SimpleNamespace(as_uri=lambda: address)), width=800)
-            names = json.dumps([path.name for path in COVERED])
-            found = browser.ask(f"""(async () => {{
-              const {{ decode }} = await import('/package/index.js');
-              const found = [];
-              for (const name of {names}) found.push(await decode(await fetch('/golden/' + name), {{ hash: true }}));
-              return found.map(each => each.hash);
-            }})()""")
-        finally:
-            browser.close()
-            server.shutdown()
-    assert found == [sha for sha, _ in expected()]
+        yield f"http://127.0.0.1:{server.server_address[1]}"
+        server.shutdown()
 
 
 class Quiet(http.server.SimpleHTTPRequestHandler):
     def log_message(self, *_: object) -> None:
         pass
+
+
+@contextlib.contextmanager
+def opened(address: str, profile: Path) -> Iterator[Chromium]:
+    browser = Chromium(find_chromium(), profile, flags=WEBGL)
+    try:
+        browser.open(SimpleNamespace(resolve=lambda: SimpleNamespace(as_uri=lambda: address)), width=800)
+        yield browser
+    finally:
+        browser.close()
+
+
+@needs_chromium
+def test_chromium_gives_the_hashes_of_the_python_decoder(tmp_path):
+    """In a worker, from the folder as it is published."""
+    names = json.dumps([path.name for path in COVERED])
+    with served(tmp_path) as address, opened(f"{address}/page.html", tmp_path / "profile") as browser:
+        found = browser.ask(f"""(async () => {{
+          const {{ decode }} = await import('/package/index.js');
+          const found = [];
+          for (const name of {names}) found.push(await decode(await fetch('/golden/' + name), {{ hash: true }}));
+          return found.map(each => each.hash);
+        }})()""")
+    assert found == [sha for sha, _ in expected()]
+
+
+@needs_chromium
+@pytest.mark.parametrize("name", ["plain", "three"])
+def test_the_examples_draw_a_file(tmp_path, name):
+    with served(tmp_path) as address:
+        if name == "three":
+            if not THREE.is_dir():
+                pytest.skip("three.js is not installed: make test-wasm does")
+            (tmp_path / "package" / "examples" / "node_modules").symlink_to(THREE)
+        page = f"{address}/package/examples/{name}.html?file=/golden/3dgs_r5_v1.swz"
+        with opened(page, tmp_path / "profile") as browser:
+            until = time.monotonic() + 30
+            while browser.ask("document.documentElement.dataset.state") != "drawn":
+                assert time.monotonic() < until, browser.complaints()
+                time.sleep(0.05)
+            assert browser.ask("document.getElementById('told').textContent") == "48 Gaussians of 3dgs"
+            browser.picture(tmp_path / "window.png", whole=False)
+    assert np.asarray(Image.open(tmp_path / "window.png").convert("L"))[100:].std() > 1
 
 
 @needs_wasmtime
