@@ -30,6 +30,7 @@ from sw_gaussians.surfels import as_ellipsoids
 from sw_view.coded_file import covers
 
 from splatwizard_core.coding.container import ContainerReader
+from splatwizard_core.coding.cuts import Prefix
 from splatwizard_core.errors import BitstreamError
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.runs.decode import decode_model
@@ -39,6 +40,7 @@ ROOT = Path(__file__).parents[3]
 THREE = ROOT / "build" / "three" / "node_modules"
 FOLDER = Path(sw_view.__file__).parent / "splatwizard-decoder"
 GOLDEN = sorted((ROOT / "tests" / "golden").glob("*.swz"))
+PACKETS = ROOT / "tests" / "golden" / "3dgs_packets_v1.swz"
 COVERED = [path for path in GOLDEN if covers(ContainerReader.open(path))]
 needs_wasmtime = pytest.mark.skipif(importlib.util.find_spec("wasmtime") is None, reason="wasmtime is not installed")
 needs_node = pytest.mark.skipif(shutil.which("node") is None, reason="Node is not installed")
@@ -68,7 +70,7 @@ class Wasmtime:
         self.api, self.engine = wasmtime, wasmtime.Engine()
         self.module = wasmtime.Module.from_file(self.engine, str(FOLDER / "decoder.wasm"))
 
-    def told(self, data: bytes, memory: int = -1) -> tuple[str | None, str | None]:
+    def told(self, data: bytes, memory: int = -1, packets: int = 0) -> tuple[str | None, str | None]:
         """Hash or reason; `memory` is the most bytes that the instance may have."""
         store = self.api.Store(self.engine)
         store.set_limits(memory_size=memory)
@@ -80,7 +82,7 @@ class Wasmtime:
 
         try:
             exports["memory"].write(store, data, exports["swz_input"](store, len(data)))
-            exports["swz_decode"](store)
+            exports["swz_decode"](store, packets)
         except self.api.Trap:
             return None, text(exports["swz_refusal"](store))
         return text(exports["swz_hash"](store)), None
@@ -94,7 +96,7 @@ def wasmtime() -> Wasmtime:
 def in_node(paths: list[Path], into: Path | None = None) -> list[tuple[str | None, str | None]]:
     script, options = Path(__file__).with_name("decode_files.mjs"), ["--into", into] if into else []
     done = subprocess.run(["node", script, *options, *paths], capture_output=True, text=True, check=True)
-    return [tuple(json.loads(line)) for line in done.stdout.splitlines()]
+    return [tuple(json.loads(line)[:2]) for line in done.stdout.splitlines()]
 
 
 def with_crcs(data: bytes, name: str, change: dict[int, int]) -> bytes:
@@ -119,7 +121,8 @@ def tampered() -> list[bytes]:
     return [damaged for name in DAMAGED for damaged in damages((GOLDEN[0].parent / f"{name}.swz").read_bytes())]
 
 
-DAMAGED = ("3dgs_r3_v1", "3dgs_exact_v1", "c3dgs_v1", "lightgaussian_ranged_v1", "mesongs_v1", "chimerags_uniform16_v1")
+DAMAGED = ("3dgs_r3_v1", "3dgs_exact_v1", "c3dgs_v1", "lightgaussian_ranged_v1", "mesongs_v1", "chimerags_uniform16_v1",
+           "3dgs_packets_v1")  # fmt: skip
 
 
 def damages(data: bytes) -> list[bytes]:
@@ -238,6 +241,28 @@ def test_a_tampered_file_gives_the_same_reason(wasmtime):
 def test_the_reason_reaches_javascript(tmp_path):
     (tmp_path / "x.swz").write_bytes(tampered()[0])
     assert in_node([tmp_path / "x.swz"]) == [told(tampered()[0])]
+
+
+@needs_wasmtime
+def test_a_file_with_cuts_is_read_up_to_each_of_them(wasmtime):
+    data = PACKETS.read_bytes()
+    reader = ContainerReader(data)
+    assert len(reader.cuts) > 2
+    for number, cut in enumerate(reader.cuts, 1):
+        wanted = decode_model(ContainerReader(data, prefix=Prefix(packets=number)), load_plugins()).parameter_hash()
+        assert wasmtime.told(data, packets=number) == (wanted, None)
+        assert wasmtime.told(data[: reader.header_bytes + cut.bytes]) == (wanted, None)
+    assert wasmtime.told(data, packets=9)[1] == f"it has {len(reader.cuts)} packets, 9 are asked for"
+
+
+@needs_node
+def test_javascript_is_shown_the_first_cut_before_the_whole():
+    script = Path(__file__).with_name("decode_files.mjs")
+    done = subprocess.run(["node", script, PACKETS, COVERED[0]], capture_output=True, text=True, check=True)
+    (_, _, coarse), whole = (json.loads(line) for line in done.stdout.splitlines())
+    first = ContainerReader(PACKETS.read_bytes()).static["packets"][0][0]
+    assert coarse == first
+    assert len(whole) == 2
 
 
 @needs_wasmtime

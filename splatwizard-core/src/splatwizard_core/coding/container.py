@@ -1,7 +1,7 @@
 """The single file (`.swz`): everything that a decoder needs, in named sections, each with length and CRC-32.
 
-Layout and keys of the header: docs/bitstream.md, chapter 1. In version 2 the
-header also holds `cuts` (see cuts.py), and the file may end at any of them. Source: specification of the codec library, container.
+Layout and keys of the header: docs/bitstream.md, chapter 1. In version 2 the header also holds `cuts` (see cuts.py), and
+the file may end at any of them. Source: specification of the codec library, container.
 """
 
 from __future__ import annotations

@@ -30,11 +30,17 @@ export interface Header {
   static: Record<string, unknown>;
   /** Name, offset, length and CRC-32 of each section. */
   sections: [string, number, number, number][];
+  /** Of a file that may end early: sections, their bytes, and PSNR or null, up to each cut. */
+  cuts?: [number, number, number | null][];
 }
 
 export interface Options {
   /** Ends the decoding early. */
   signal?: AbortSignal;
+  /** Of a file with cuts, how many of its packets to decode; 0, the default: all. */
+  packets?: number;
+  /** Called with coarser Gaussians of a file with cuts, before it is whole: while a Response arrives, else for its first cut. */
+  onCut?: (coarse: Gaussians) => void;
   /** Whether to compute the hash of the decoded parameters. */
   hash?: boolean;
   /** Whether to decode in a thread of its own; the default where the platform has `Worker`. */

@@ -25,11 +25,18 @@ export function info(bytes) {
   }
 }
 
+/** Lengths at which a file may end, up to the end of each of its packets; [] without cuts, or before its header is there. */
+export function cutEnds(bytes) {
+  const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
+  if (bytes.length < 10 || bytes.length < 14 + view.getUint32(6, true)) return [];
+  return (info(bytes).cuts ?? []).map(([, end]) => 14 + view.getUint32(6, true) + end);
+}
+
 /**
  * The parameters in a file by name, each { shape, data: Float32Array }; with `hash` the SHA-256 of them, which
- * `sw decode --hash` prints. An instance of the module lives for this call only, and with it all memory but the result.
+ * `sw decode --hash` prints; of a file with cuts `packets` may be how many to read. An instance of the module lives for this call only, and with it all memory but the result.
  */
-export function parameters(module, bytes, { hash = false } = {}) {
+export function parameters(module, bytes, { hash = false, packets = 0 } = {}) {
   const { exports } = new WebAssembly.Instance(module, {});
   exports._initialize();
   const text = at => {
@@ -39,7 +46,7 @@ export function parameters(module, bytes, { hash = false } = {}) {
   try {
     const at = exports.swz_input(bytes.length);
     new Uint8Array(exports.memory.buffer, at, bytes.length).set(bytes);
-    exports.swz_decode();
+    exports.swz_decode(packets);
   } catch (error) {
     if (!(error instanceof WebAssembly.RuntimeError)) throw error;
     throw new DecodeError(text(exports.swz_refusal()) || `the decoder failed: ${error.message}`);

@@ -12,7 +12,7 @@ namespace swz {
 
 // The text of a refusal, put together from parts.
 struct Text {
-  char data[512];
+  char data[512] = "";
   int size = 0;
 
   void put(const char* text) {

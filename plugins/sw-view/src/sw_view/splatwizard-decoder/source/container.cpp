@@ -38,8 +38,9 @@ const Json* read_header(Bytes& file) {
   if (version < 1) refuse("container version ", version, " does not exist: the file is damaged");
   if (length > MAX_HEADER)
     refuse("header of ", grouped(length), " bytes, at most ", grouped(MAX_HEADER), " are allowed");
-  if (version > 1)
-    refuse("container version ", version, " is newer than 1, the newest that this installation reads");
+  if (version > 2)
+    refuse("container version ", version, " is newer than 2, the newest that this installation reads: upgrade "
+           "splatwizard-core with pip install --upgrade splatwizard-core");
   const int64_t start = PREFIX + length + 4;
   if (size < start)
     refuse("the file ends inside its header (", grouped(size), " of ", grouped(start), " bytes): it is truncated");
@@ -47,17 +48,20 @@ const Json* read_header(Bytes& file) {
   if (crc32(raw.data, raw.left) != file.integer(4))
     refuse("the CRC-32 of the header does not match: the file is damaged");
   const Json* header = parse_json(raw);
-  const char* keys[] = {"method", "method_version", "raster", "static", "sections"};
-  bool exact = header->kind == Json::OBJECT && header->length == 5 + (header->find("requires") != nullptr);
-  for (int i = 0; exact && i < 5; ++i) exact = header->find(keys[i]) != nullptr;
+  const char* keys[] = {"cuts", "method", "method_version", "raster", "sections", "static"};
+  const int first = version == 2 ? 0 : 1;
+  bool exact = header->kind == Json::OBJECT && header->length == 6 - first + (header->find("requires") != nullptr);
+  for (int i = first; exact && i < 6; ++i) exact = header->find(keys[i]) != nullptr;
   if (!exact)
-    refuse("header must hold exactly method, method_version, raster, static, sections, and it may hold requires");
+    refuse("header must hold exactly ", first ? "" : "cuts, ",
+           "method, method_version, raster, sections, static, and it may hold requires");
   return header;
 }
 
 }  // namespace
 
-Container::Container(Bytes file) {
+Container::Container(Bytes file, int64_t asked) {
+  const int64_t size = file.left;
   header = read_header(file);
   method = member(header, "method", Json::STRING, "str");
   version = member(header, "method_version", Json::INTEGER, "int")->integer;
@@ -65,10 +69,26 @@ Container::Container(Bytes file) {
   member(header, "static", Json::OBJECT, "dict");
   const Json* table = member(header, "sections", Json::ARRAY, "list");
   if (!is_name(*method, ".-") || version < 0 || version > INT32_MAX) refuse("header names no valid method and version");
+  read_rows(table);
+  int64_t wanted = table->length;
+  if (const Json* rows = header->find("cuts"); rows != nullptr)
+    wanted = choose_cut(rows, file.left, size - file.left, asked);
+  else if (asked > 0)
+    refuse("it declares no cuts, it is decoded whole or not at all");
+  if (cuts && packets) {  // what lies behind the cut is not there
+    int64_t bytes = 0;
+    const Json* row = table->first;
+    for (int64_t i = 0; i < wanted; ++i, row = row->next) bytes += row->first->next->next->integer;
+    file.left = bytes;
+  }
+  payload = file.left;
+  read_sections(table, file, wanted);
+}
+
+void Container::read_rows(const Json* table) {
   if (table->length > MAX_SECTIONS)
     refuse(grouped(table->length), " sections, at most ", MAX_SECTIONS, " are allowed");
   sections = static_cast<Section*>(std::malloc(sizeof(Section) * static_cast<size_t>(table->length + 1)));
-  payload = file.left;
   int64_t position = 0;
   for (const Json* row = table->first; row != nullptr; row = row->next) {
     if (row->kind != Json::ARRAY || row->length != 4 || row->first->kind != Json::STRING)
@@ -77,17 +97,68 @@ Container::Container(Bytes file) {
     bool usable = is_name(*name, "./-") && !name->is("header");
     for (int64_t i = 0; usable && i < count; ++i) usable = !name->is(sections[i].name);
     if (!usable) refuse("section name '", name->text, "' is malformed or appears twice");
+    sections[count++] = {name->text, {}, false};
     const Json *offset = name->next, *length = offset->next, *crc = length->next;
     const Blame blame(name->text);
     for (const Json* number : {offset, length, crc})
-      if (number->kind != Json::INTEGER || number->integer < 0 || offset->integer != position)
+      if (number->kind != Json::INTEGER || number->integer < 0 || offset->integer != position ||
+          number->integer > INT64_MAX / 8192)
         refuse("offset, length or crc32 make no sense in the section table");
+    position += length->integer;
+  }
+}
+
+int64_t Container::choose_cut(const Json* rows, int64_t length, int64_t header_bytes, int64_t asked) {
+  if (rows->kind != Json::ARRAY || rows->length < 1 || rows->length > count)
+    refuse("cuts are no list, or not from one to as many as there are sections");
+  const Json* row = header->find("sections")->first;
+  int64_t done = 0, bytes = 0, there = 0, chosen = 0, first_end = 0, there_end = 0;
+  bool at_cut = false;
+  for (const Json* cut = rows->first; cut != nullptr; cut = cut->next) {
+    const Json* number = cut->first;
+    if (cut->kind != Json::ARRAY || cut->length != 3 || number->kind != Json::INTEGER ||
+        number->next->kind != Json::INTEGER)
+      refuse("a row of the cuts is not [sections, bytes, psnr]");
+    const int64_t wanted = number->integer, end = number->next->integer;
+    const Json* psnr = number->next->next;
+    if (psnr->kind != Json::NOTHING && !(psnr->is_number() && __builtin_fabs(psnr->number) <= 1000))
+      refuse("the PSNR of a cut is beyond 1000, or no number");
+    if (wanted <= done || wanted > count || end <= bytes) refuse("cuts do not grow, or lie beyond the last section");
+    for (; done < wanted; ++done, row = row->next) bytes += row->first->next->next->integer;
+    if (bytes != end) refuse("a cut of ", grouped(end), " bytes lies inside of a section");
+    ++cuts;
+    if (cuts == 1) first_end = header_bytes + end;
+    if (end <= length) there = cuts, there_end = header_bytes + end;
+    at_cut |= end == length;
+    if (cuts == asked || (asked == 0 && end <= length)) chosen = wanted;
+  }
+  if (done != count) refuse("the last cut is not the end of the file");
+  if (length > bytes) {  // what follows the last section is refused like that of any file
+    packets = 0;
+    return count;
+  }
+  if (!at_cut && there)
+    refuse(grouped(header_bytes + length), " bytes end at no declared cut: the file is truncated; the longest cut that is "
+           "whole is packet ", there, " (", grouped(there_end), " bytes): --partial decodes it");
+  if (!at_cut)
+    refuse(grouped(header_bytes + length), " bytes end at no declared cut: the file is truncated; the first cut is at ",
+           grouped(first_end), " bytes");
+  if (asked > there) refuse("it has ", there, " packets, ", asked, " are asked for");
+  packets = asked ? asked : there;
+  return chosen;
+}
+
+void Container::read_sections(const Json* table, Bytes file, int64_t wanted) {
+  const Json* row = table->first;
+  count = wanted;
+  for (int64_t i = 0; i < wanted; ++i, row = row->next) {
+    const Json *length = row->first->next->next, *crc = length->next;
+    const Blame blame(sections[i].name);
     if (length->integer > file.left)
       refuse("is ", grouped(file.left), " bytes, header says ", grouped(length->integer), ": the file is truncated");
-    const Bytes content = file.take(length->integer);
-    if (crc32(content.data, content.left) != crc->integer) refuse("its CRC-32 does not match: the file is damaged");
-    sections[count++] = {name->text, content, false};
-    position += content.left;
+    sections[i].content = file.take(length->integer);
+    if (crc32(sections[i].content.data, length->integer) != crc->integer)
+      refuse("its CRC-32 does not match: the file is damaged");
   }
   if (file.left) refuse(grouped(file.left), " bytes follow the last section: the file is damaged");
 }

@@ -17,8 +17,10 @@ struct Container {
   int64_t version = 0;  // of the layout of the method
   Section* sections = nullptr;
   int64_t count = 0, payload = 0;
+  int64_t cuts = 0, packets = 0;  // declared, and read of them; of a file without cuts 0
 
-  explicit Container(Bytes file);
+  // Reads the first packets of a file with cuts, `asked` of them; 0: all that are there.
+  Container(Bytes file, int64_t asked);
 
   Bytes section(const char* name);  // refuses the file if it has none of that name
   // An array section of this dtype and shape, an axis of -1 being none: its values, little-endian.
@@ -29,6 +31,11 @@ struct Container {
   void usual(const char* part, const char* name) const;  // refuses a file that names anything else for a part
   void allow(int64_t decoded, int64_t gaussians) const;  // refuses what so small a file must not stand for
   void finish() const;                                   // refuses sections that nobody asked for
+
+ private:
+  void read_rows(const Json* table);
+  int64_t choose_cut(const Json* rows, int64_t length, int64_t header_bytes, int64_t asked);  // sections that are read
+  void read_sections(const Json* table, Bytes file, int64_t wanted);
 };
 
 }  // namespace swz

@@ -62,8 +62,9 @@ EXPORT(swz_input) uint8_t* swz_input(int32_t bytes) {
   return input.data;
 }
 
-EXPORT(swz_decode) void swz_decode() {
-  Container file(Bytes{input.data, input.size});
+// Decodes the first `packets` packets of a file with cuts; 0: all that are there.
+EXPORT(swz_decode) void swz_decode(int32_t packets) {
+  Container file(Bytes{input.data, input.size}, packets);
   decode(file);
 }
 

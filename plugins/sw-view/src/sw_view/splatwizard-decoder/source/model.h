@@ -35,6 +35,12 @@ struct Gaussians {
 
   Gaussians(int64_t gaussians, int64_t sh_degree, int64_t scales);
 
+  // Goes on behind so many Gaussians.
+  void advance(int64_t gaussians, int64_t scales) {
+    means += 3 * gaussians, log_scales += scales * gaussians, quats += 4 * gaussians, opacity_logits += gaussians;
+    sh_dc += 3 * gaussians, sh_rest += 3 * rest * gaussians;
+  }
+
   // Coefficients of band 0, then the others of red, of green, of blue, as SH of one Gaussian.
   void put_sh(int64_t gaussian, const float* coefficients, int64_t others) const {
     for (int64_t color = 0; color < 3; ++color) {

@@ -20,12 +20,20 @@ constexpr const char* BESIDE[] = {"entropy", "positions", "mode", "codec", "meth
                                   "lambda_normal", "world_origin"};
 constexpr const char* KEYS[] = {"num_gaussians", "max_sh_degree", "active_sh_degree", "position_bits", "center",
                                 "width", "top", "dc_step", "rest_step", "opacity_step", "scale_step", "quat_step",
-                                "sh_classes", "primitive"};
+                                "sh_classes", "primitive", "packets"};
 
 struct Layout {
   int64_t count, degree, active, bits, classes, scales;
   double center[3], width[3], top[3];
   double dc_step, rest_step, opacity_step, scale_step, quat_step;
+};
+
+constexpr int64_t MOST_PACKETS = 64;
+
+// Rows of the packets that are read.
+struct Packets {
+  int64_t count = 0, rows[MOST_PACKETS];
+  double swell = 0;  // what the last of them adds to log scales
 };
 
 [[noreturn]] void wrong(const char* key, const char* reason) { refuse("header value '", key, "': ", reason); }
@@ -73,6 +81,32 @@ void three(const Container& file, const char* key, bool integers, double* to) {
            static_cast<int64_t>(found->length));
 }
 
+// Rows [n, g] of `packets`, which fit the cuts of the file. A file without packets is one of its own.
+Packets packets_of(const Container& file, int64_t gaussians) {
+  Packets found;
+  const Json* rows = file.value("packets");
+  const bool stated = rows != nullptr && rows->kind != Json::NOTHING;
+  int64_t all = 0, sum = 0;
+  if (stated) {
+    if (rows->kind != Json::ARRAY) wrong("packets", "Input should be a valid list");
+    if (rows->length < 1) wrong("packets", "List should have at least 1 item after validation, not 0");
+    if (rows->length > MOST_PACKETS) wrong("packets", "List should have at most 64 items after validation");
+    for (const Json* row = rows->first; row != nullptr; row = row->next, ++all) {
+      const Json* number = row->first;
+      if (row->kind != Json::ARRAY || row->length != 2 || number->kind != Json::INTEGER || !number->next->is_number() ||
+          number->integer < 0 || number->integer > UINT32_MAX || !(number->next->number >= 0 && number->next->number <= 10))
+        wrong("packets", "Input should be rows of a packet and what it adds to log scales");
+      sum += number->integer;
+      if (all >= file.packets) continue;
+      found.rows[found.count++] = number->integer;
+      found.swell = number->next->number;
+    }
+  }
+  if (all != file.cuts || (stated && sum != gaussians)) refuse("cuts, packets and their Gaussians do not fit together");
+  if (!stated) found.rows[found.count++] = gaussians;
+  return found;
+}
+
 Layout layout_of(const Container& file) {
   Layout found;
   found.count = integer(file, "num_gaussians", 0, UINT32_MAX);
@@ -99,11 +133,14 @@ Layout layout_of(const Container& file) {
   }
   file.usual("entropy", "columns");
   file.usual("positions", "octree");
-  if (found.active > found.degree) refuse("header activates more SH bands than there are");
-  for (int axis = 0; axis < 3; ++axis)
-    if (!(found.width[axis] > 0 && found.width[axis] < 1e30 && found.top[axis] >= 1 && found.top[axis] <= 40))
-      refuse("header describes no usable position grid");
   return found;
+}
+
+void check_grid(const Layout& layout) {
+  if (layout.active > layout.degree) refuse("header activates more SH bands than there are");
+  for (int axis = 0; axis < 3; ++axis)
+    if (!(layout.width[axis] > 0 && layout.width[axis] < 1e30 && layout.top[axis] >= 1 && layout.top[axis] <= 40))
+      refuse("header describes no usable position grid");
 }
 
 // The coordinate of a cell on an axis.
@@ -238,23 +275,24 @@ void put_band(Bytes data, const Layout& layout, int band, Buffer<int64_t>& activ
   }
 }
 
-}  // namespace
-
-void decode_quantized(Container& file) {
-  const Layout layout = layout_of(file);
+// The rows of one packet, whose sections have this prefix; `to` begins with the first of them.
+void decode_rows(Container& file, const Layout& layout, const char* prefix, Gaussians to) {
   const int64_t n = layout.count;
-  file.allow(4 * n * (8 + layout.scales + 3 * (layout.degree + 1) * (layout.degree + 1)), n);
-  Gaussians to(n, layout.degree, layout.scales);
-  const auto matrix_of = [&](const char* name, int64_t width, const auto& put) {
-    const Bytes data = file.section(name);
-    const Blame blame(name);
-    Matrix matrix(data, n, width);
-    put(matrix);
-    matrix.finish();
+  const auto section_of = [&](const char* name, const auto& decode) {
+    Text whole;
+    whole.put(prefix), whole.put(name);
+    const Bytes data = file.section(whole.data);
+    const Blame blame(whole.data);
+    decode(data);
   };
-  {
-    const Bytes data = file.section("positions");
-    const Blame blame("positions");
+  const auto matrix_of = [&](const char* name, int64_t width, const auto& put) {
+    section_of(name, [&](Bytes data) {
+      Matrix matrix(data, n, width);
+      put(matrix);
+      matrix.finish();
+    });
+  };
+  section_of("positions", [&](Bytes data) {
     const Points points = octree(data);
     if (points.codes.size != n) refuse("holds ", grouped(points.codes.size), " points, header says ", grouped(n));
     if (n && points.bits > layout.bits) {
@@ -264,7 +302,7 @@ void decode_quantized(Container& file) {
       if (highest >> layout.bits) refuse("a point leaves the grid of ", layout.bits, " bits");
     }
     put_means(layout, points, to.means);
-  }
+  });
   matrix_of("color", 3, [&](Matrix& matrix) {
     put_color(matrix, layout.dc_step, to.sh_dc, 3, [](int64_t i) { return i; }, nullptr);
   });
@@ -274,11 +312,30 @@ void decode_quantized(Container& file) {
   Buffer<int64_t> activity(n);
   activity.clear();
   const char* bands[] = {"sh1", "sh2", "sh3"};
-  for (int band = 1; band <= layout.active; ++band) {
-    const Bytes data = file.section(bands[band - 1]);
-    const Blame blame(bands[band - 1]);
-    put_band(data, layout, band, activity, to);
+  for (int band = 1; band <= layout.active; ++band)
+    section_of(bands[band - 1], [&](Bytes data) { put_band(data, layout, band, activity, to); });
+}
+
+}  // namespace
+
+void decode_quantized(Container& file) {
+  Layout layout = layout_of(file);
+  const Packets packets = packets_of(file, layout.count);
+  check_grid(layout);
+  int64_t n = 0;
+  for (int64_t i = 0; i < packets.count; ++i) n += packets.rows[i];
+  file.allow(4 * n * (8 + layout.scales + 3 * (layout.degree + 1) * (layout.degree + 1)), n);
+  const Gaussians whole(n, layout.degree, layout.scales);
+  Gaussians part = whole;
+  for (int64_t i = 0; i < packets.count; ++i) {
+    layout.count = packets.rows[i];
+    Text prefix;
+    if (file.cuts) prefix.put(i + 1), prefix.put("/");
+    decode_rows(file, layout, prefix.data, part);
+    part.advance(layout.count, layout.scales);
   }
+  const auto swell = static_cast<float>(packets.swell);
+  for (int64_t i = 0; i < n * layout.scales; ++i) whole.log_scales[i] += swell;
   decoded.check_finite();
 }
 
