@@ -1,6 +1,6 @@
 """The single file (`.swz`): everything that a decoder needs, in named sections, each with length and CRC-32.
 
-Layout and keys of the header: docs/bitstream.md, chapter 1. In version 2 the header also holds `cuts` (see cuts.py), and
+Layout and keys of the header: docs/bitstream.md, chapter 1. In version 2 the header also holds `cuts` (see cuts.py):
 the file may end at any of them. Source: specification of the codec library, container.
 """
 
