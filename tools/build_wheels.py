@@ -51,7 +51,7 @@ def compiled(package: Path, machine: str, into: Path) -> Iterator[Path]:
         for name in DECLARES.findall(path.read_text(encoding="utf-8")):
             relative = path.relative_to(package / "src")
             module = getattr(importlib.import_module(".".join(relative.with_suffix("").parts)), name)
-            if not isinstance(module, NativeModule) or not module.face:
+            if not isinstance(module, NativeModule) or not module.face or module.cuda_sources:
                 continue
             tools = Toolchain()
             with tempfile.TemporaryDirectory() as scratch:

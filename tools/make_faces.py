@@ -55,6 +55,7 @@ def stub(path: Path) -> str:
             may_be_left_out = f.optional or f.name in counts
             if not f.out:
                 lines.append(f"    {f.name}: {kind_of(f)}{' | None = None' * may_be_left_out},")
+        lines += ["    device: int | None = None,"] if module.cuda_sources else []
         lines.append(f") -> {f'{name}_call' if any(f.out for f in fields) else 'Structure'}: ...")
     body = "\n".join(lines)
     words = set(re.findall(r"\w+", body))

@@ -1,5 +1,6 @@
 """CUDA sources: when they are compiled, for which GPUs, and what is said where they cannot be."""
 
+import importlib
 import json
 import re
 from pathlib import Path
@@ -82,6 +83,65 @@ def test_a_cuda_toolkit_that_does_not_fit_torch_is_named(package, monkeypatch, t
         assert reason is not None
         assert re.search(message, reason)
     assert module.state()["target"] == ("cpu" if message else "cuda")
+
+
+GPU_FACE = """
+#include <splatwizard/c_face.h>
+typedef struct {
+  sw_head head;
+  const float* x;  // [count]
+  int64_t count;
+  int64_t refused;
+} look_call;
+SW_OPERATION(answer, look);
+"""
+GPU_SOURCE = """
+#include "face.h"
+#include <splatwizard/cuda_face.h>
+void look(const float* x, int count, cudaStream_t stream);
+SW_OPERATION(answer, look) {
+  return splatwizard::guarded_on_gpu(call, [&](cudaStream_t stream) {
+    if (call->refused) splatwizard::refuse("%lld is refused", (long long)call->refused);
+    look(call->x, int(call->count), stream);
+  });
+}
+"""
+GPU_KERNEL = """
+#include <cuda_runtime_api.h>
+__global__ void kernel(const float* x) {}
+void look(const float* x, int count, cudaStream_t stream) { kernel<<<count, 1, 0, stream>>>(x); }
+"""
+
+
+@needs_compiler
+@pytest.mark.skipif(cuda_toolkit.find_nvcc() is None, reason="no CUDA compiler on this machine")
+def test_a_face_for_gpus_is_built_without_torch_and_tells_cudas_errors(package, monkeypatch):
+    import torch
+
+    from splatwizard_native import face
+    from splatwizard_native.face_operations import operations
+
+    package.write("face.h", GPU_FACE)
+    package.write("answer.cpp", GPU_SOURCE)
+    package.write("kernel.cu", GPU_KERNEL)
+    package.write("offered.py", "")
+    monkeypatch.setattr(torch.version, "cuda", torch.version.cuda or "13.0")
+    monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "9.0")
+    monkeypatch.setattr(face, "current_stream", lambda device: 0)
+    module = package.module(cuda_sources=("kernel.cu",), face="face.h")
+    module.load()
+    assert module.state()["state"] == "built"
+    log = module.build().with_suffix(".log").read_text()
+    assert "/torch/" not in log
+    assert "-lcudart_static" in log
+    offered = importlib.import_module(f"{package.folder.name}.offered")
+    offered.__getattr__ = operations(module, offered.__name__)
+    with pytest.raises(RuntimeError, match=r"look: x must be .* on the GPU, got .* on cpu"):
+        offered.look(x=torch.zeros(3), refused=0)
+    with pytest.raises(RuntimeError, match=r"look: x must be .* on the GPU, got .* on cpu"):
+        offered.look(x=torch.zeros(3), refused=0, device=0)
+    with pytest.raises(RuntimeError, match=r"^look: CUDA: \w+|^look: 1 is refused$"):  # there may be a GPU
+        offered.look(x=0, count=1, refused=1, device=0)
 
 
 @needs_compiler

@@ -258,13 +258,13 @@ class NativeModule:
             platform.system(), platform.machine(), march,
             toolchain.arch_variants(march), toolchain.cpu_identity() if march == "native" else "", self.cflags, (),
         ]  # fmt: skip
-        if cuda and torch is not None:
-            facts += [torch.version.cuda, () if any_gpu else cuda_toolkit.architectures(), ()]
+        if cuda:
+            facts += [torch and torch.version.cuda, () if any_gpu else cuda_toolkit.architectures(), ()]
         return self._digest(facts, self._files(cuda))
 
     def source_hash(self) -> str:
         """Digest of sources and flags, whatever compiles them: a library with a face tells it."""
-        return self._digest([self.name, ABI, self.cflags], self._files(False))
+        return self._digest([self.name, ABI, self.cflags], self._files(True))
 
     def _digest(self, facts: list[object], files: Sequence[Path]) -> str:
         digest = hashlib.sha256(repr(facts).encode())
@@ -364,7 +364,8 @@ class NativeModule:
         # The binding runs on every machine that the binary is for, so it gets the lowest of the variants.
         lowest = next(iter(variants.values()))
         include = toolchain.SHARED_INCLUDE_FLAGS
-        torchs = () if self.face else toolchain.torch_include_flags(cuda=cuda)
+        cudas = toolchain.cuda_include_flags() if cuda else ()
+        torchs = cudas if self.face else toolchain.torch_include_flags(cuda=cuda)
         binding = (*shared, *lowest, *include, *torchs, *self.cflags)
         sources = [root / s for s in self.sources]
         if self.face:
@@ -412,7 +413,9 @@ class NativeModule:
             try:
                 tools.compile(missing, build_log)
                 self._check_headers(missing)
-                plain = toolchain.plain_libraries(march, shown) if self.face else toolchain.torch_libraries(cuda=cuda)
+                plain = toolchain.torch_libraries(cuda=cuda)
+                if self.face:
+                    plain = toolchain.plain_libraries(march, shown, cuda=cuda)
                 tools.link([j.output for j in jobs], built, build_log, plain)
             except NativeBuildError as error:
                 raise NativeBuildError(f"\n{error}\nfull log: {build_log}") from error

@@ -102,10 +102,13 @@ def torch_include_flags(*, cuda: bool) -> tuple[str, ...]:
 
     base = Path(torch.__file__).parent / "include"
     paths = [base, base / "torch" / "csrc" / "api" / "include"]
-    nvcc = cuda_toolkit.find_nvcc() if cuda else None
-    if nvcc is not None:
-        paths.append(cuda_toolkit.root_of(nvcc) / "include")
-    return tuple(flag for path in paths for flag in ("-isystem", str(path)))
+    return (*(f for path in paths for f in ("-isystem", str(path))), *(cuda_include_flags() if cuda else ()))
+
+
+def cuda_include_flags() -> tuple[str, ...]:
+    """-isystem flags for CUDA's headers."""
+    nvcc = cuda_toolkit.find_nvcc()
+    return () if nvcc is None else ("-isystem", str(cuda_toolkit.root_of(nvcc) / "include"))
 
 
 def arch_variants(march: str) -> dict[str, tuple[str, ...]]:
@@ -179,11 +182,21 @@ def torch_libraries(*, cuda: bool) -> list[str]:
     return [*runtime_libraries(), *extra, *libraries]
 
 
-def plain_libraries(march: str, shown: Path) -> list[str]:
-    """Return what links a library with a plain C face: a portable one brings its C++ runtime, shows a list."""
-    if march != "native" and sys.platform == "linux":
-        return ["-pthread", "-static-libstdc++", "-static-libgcc", f"-Wl,--version-script={shown}", "-Wl,-s"]
-    return [*runtime_libraries(), "-pthread"]
+def plain_libraries(march: str, shown: Path, *, cuda: bool = False) -> list[str]:
+    """Return what links a library with a plain C face: a portable one brings its C++ runtime, shows a list.
+
+    One for GPUs brings CUDA's runtime, and hides it: it must not mix with that of torch, which may be another one.
+    """
+    nvcc = cuda_toolkit.find_nvcc() if cuda else None
+    libraries = ["-pthread"]
+    if nvcc is not None:
+        libraries += ["-L", str(cuda_toolkit.root_of(nvcc) / "lib64"), "-lcudart_static", "-ldl", "-lrt"]
+    portable = march != "native" and sys.platform == "linux"
+    if portable or cuda:
+        libraries.append(f"-Wl,--version-script={shown}")
+    if portable:
+        return [*libraries, "-static-libstdc++", "-static-libgcc", "-Wl,-s"]
+    return [*runtime_libraries(), *libraries]
 
 
 def runtime_libraries() -> list[str]:
