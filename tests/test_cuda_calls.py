@@ -1,0 +1,103 @@
+"""Every operation on CUDA is called by its wrapper as its header says; stand-ins do for GPU and libraries."""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import torch
+from sw_doctor.building import resolve_module
+from sw_doctor.declared_modules import declared_modules
+
+from splatwizard_core.plugins import load_plugins
+from splatwizard_native import NativeModule
+from splatwizard_native import face as native_face
+from splatwizard_native.face import OPERATION, read_structs, structure
+
+STREAM = 4711
+DECLARED = [resolve_module(target) for target in declared_modules(load_plugins())]
+MODULES = [m.cuda for m in DECLARED if m.cuda is not None and m.cuda.face]
+
+
+def rand(*shape: int, grad: bool = False) -> Any:
+    return torch.rand(shape, requires_grad=grad)
+
+
+class Library:
+    """Stands for the library of a module: notes what its operations are handed, and says that all went well."""
+
+    def __init__(self, module: NativeModule, calls: dict[str, list[Any]]) -> None:
+        self.module, self.calls, self.structs = module, calls, read_structs(module.face_header)
+
+    def __getattr__(self, name: str) -> Any:
+        operation = name.removeprefix(f"{self.module.name}_")
+        if operation == "last_error":
+            return lambda: b"refused"
+        kind = structure(operation, self.structs[f"{operation}_call"], call=True)
+
+        def call(reference: Any) -> int:
+            handed = kind.from_buffer_copy(reference._obj)
+            assert (handed.size, handed.abi) == (ctypes.sizeof(kind), native_face.ABI)
+            assert (handed.device, handed.stream) == (0, STREAM)
+            self.calls.setdefault(operation, []).append(handed)
+            return 0
+
+        return call
+
+
+@pytest.fixture
+def calls(monkeypatch) -> Iterator[dict[str, list[Any]]]:
+    """The structs that were handed to the operations so far, by operation; all tensors say that they are on a GPU."""
+    found: dict[str, list[Any]] = {}
+    monkeypatch.setattr(native_face, "current_stream", lambda device: STREAM + device)
+    monkeypatch.setattr(NativeModule, "has_cuda", lambda self: True)
+    monkeypatch.setattr(NativeModule, "library", property(lambda self: Library(self, found)))
+    for name, told in {"is_cuda": True, "is_cpu": False, "device": torch.device("cuda", 0)}.items():
+        monkeypatch.setattr(torch.Tensor, name, property(lambda self, told=told: told), raising=False)
+    monkeypatch.setattr(torch.Tensor, "get_device", lambda self: 0, raising=False)
+    faces = [m for name, m in sys.modules.items() if name.endswith("cuda_face")]
+    before = [dict(vars(face)) for face in faces]
+    for face in faces:
+        for module in MODULES:
+            for _, name in OPERATION.findall(module.face_header):
+                monkeypatch.delattr(face, name, raising=False)
+    yield found
+    for face, names in zip(faces, before, strict=True):
+        for name in set(vars(face)) - set(names):
+            delattr(face, name)
+
+
+def test_training(calls):
+    from splatwizard_native.fused.activations import activated
+    from splatwizard_native.fused.adam import AdamUpdate, adam_steps
+    from splatwizard_native.fused.photometric import photometric
+
+    x, y = rand(3, 40, 70, grad=True), rand(3, 40, 70)
+    total, _, _ = photometric(x, y, 0.2)
+    (grad,) = torch.autograd.grad(total, x, torch.ones(()))
+    assert grad.shape == x.shape
+    (first,) = calls["photometric"]
+    assert (first.planes, first.height, first.width, first.valid, first.sum_count) == (3, 40, 70, False, 2 + 2 * 18)
+    assert (first.l1_weight, first.ssim_weight, first.offset) == (0.8, -0.2, 0.2)
+    (back,) = calls["photometric_backward"]
+    assert (back.slopes, back.grad) == (first.slopes, grad.data_ptr())
+    with torch.no_grad():
+        photometric(x, y, 0.2, "valid")
+    assert (calls["photometric"][1].slopes, calls["photometric"][1].valid) == (None, True)
+
+    log_scales, logits = rand(5, 3, grad=True), rand(5, grad=True)
+    _, opacities = activated(log_scales, logits)
+    assert (calls["activate"][0].scale_count, calls["activate"][0].opacity_count) == (15, 5)
+    torch.autograd.grad(opacities, logits, rand(5))
+    (back,) = calls["activate_backward"]
+    assert (back.scale_count, back.opacity_count, back.by_scales, back.by_log_scales) == (0, 5, None, None)
+    assert back.opacities == opacities.data_ptr()
+
+    update = AdamUpdate(*(rand(4, 4) for _ in range(4)), lr=0.1, beta1=0.9, beta2=0.99, eps=1e-8, step=1)
+    version = update.param._version
+    adam_steps([update, update])
+    assert calls["adam"][0].count == 2
+    assert update.param._version > version
