@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import sys
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -101,3 +102,31 @@ def test_training(calls):
     adam_steps([update, update])
     assert calls["adam"][0].count == 2
     assert update.param._version > version
+
+
+def test_gaussians(calls):
+    from sw_gaussians.fast.sparse_adam import left_of
+    from sw_gaussians.fast.statistics import accumulate, accumulate_fragments
+    from sw_gaussians.surface_losses import _disagreement
+
+    from splatwizard_native import AdamUpdate
+
+    updates = [AdamUpdate(*(rand(6, width) for _ in range(4)), 0.1, 0.9, 0.99, 1e-8, 1) for width in (1, 4)]
+    updates.append(AdamUpdate(*(rand(7, 2) for _ in range(4)), 0.1, 0.9, 0.99, 1e-8, 1))
+    assert left_of(updates, torch.ones(6, dtype=torch.bool)) == updates[2:]
+    assert (calls["sparse_adam"][0].count, calls["sparse_adam"][0].rows) == (2, 6)
+
+    sums = SimpleNamespace(grad_accum=rand(5), denom=rand(5), max_radii2d=rand(5))
+    assert accumulate(sums, rand(5, 2), torch.ones(5, dtype=torch.int32))
+    assert calls["view_statistics"][0].rows == 5
+    assert accumulate_fragments(rand(5, 3), rand(5), rand(5), rand(5, 2), least_clear=0.5)
+    assert calls["fragment_statistics"][0].least_clear == 0.5
+    assert not accumulate_fragments(rand(5, 3), rand(5), rand(5).double(), rand(5, 2), least_clear=0.5)
+
+    depth, normals = rand(1, 4, 6, grad=True), rand(3, 4, 6, grad=True)
+    lens = SimpleNamespace(fx=1.0, fy=2.0, cx=3.0, cy=4.0)
+    found = _disagreement(depth, normals, rand(1, 4, 6), lens)
+    to_depth, to_normals = torch.autograd.grad(found, (depth, normals), rand(1, 4, 6))
+    (back,) = calls["disagreement_backward"]
+    assert (back.height, back.width, back.fx, back.fy, back.cx, back.cy) == (4, 6, 1, 2, 3, 4)
+    assert (back.to_depth, back.to_normals) == (to_depth.data_ptr(), to_normals.data_ptr())
