@@ -47,7 +47,9 @@ def stub(path: Path) -> str:
         if shown:
             lines += ["", f"class {name}(Structure):"]
             lines += [f"    {f.name}: {'int | None' if f.pointer else ONE.get(f.kind, 'int')}" for f in shown]
-    for _, name in OPERATION.findall(header):
+    for owner, name in OPERATION.findall(header):
+        if owner != module.name:
+            continue
         fields = structs[f"{name}_call"]
         counts = counts_of(fields)
         lines += [*([""] if not lines or lines[-1][:1] == " " else []), f"def {name}(", "    *,"]

@@ -292,7 +292,7 @@ class NativeModule:
     def _open(self, library: Path) -> str | None:
         """Load a library; the reason if that fails."""
         if self.face:
-            symbols = [f"{module}_{operation}" for module, operation in OPERATION.findall(self.face_header)]
+            symbols = [f"{module}_{op}" for module, op in OPERATION.findall(self.face_header) if module == self.name]
             try:
                 self._session.library = open_face(library, self.name, self.source_hash(), symbols)
             except OSError as error:
