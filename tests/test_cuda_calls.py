@@ -80,14 +80,14 @@ def test_training(calls):
     total, _, _ = photometric(x, y, 0.2)
     (grad,) = torch.autograd.grad(total, x, torch.ones(()))
     assert grad.shape == x.shape
-    (first,) = calls["photometric"]
+    (first,) = calls["photometric_loss"]
     assert (first.planes, first.height, first.width, first.valid, first.sum_count) == (3, 40, 70, False, 2 + 2 * 18)
     assert (first.l1_weight, first.ssim_weight, first.offset) == (0.8, -0.2, 0.2)
-    (back,) = calls["photometric_backward"]
+    (back,) = calls["photometric_loss_backward"]
     assert (back.slopes, back.grad) == (first.slopes, grad.data_ptr())
     with torch.no_grad():
         photometric(x, y, 0.2, "valid")
-    assert (calls["photometric"][1].slopes, calls["photometric"][1].valid) == (None, True)
+    assert (calls["photometric_loss"][1].slopes, calls["photometric_loss"][1].valid) == (None, True)
 
     log_scales, logits = rand(5, 3, grad=True), rand(5, grad=True)
     _, opacities = activated(log_scales, logits)

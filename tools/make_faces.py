@@ -41,15 +41,15 @@ def stub(path: Path) -> str:
     module = importlib.import_module(module_of(path)).MODULE
     header = module.face_header
     structs = read_structs(header)
+    owned = [name for owner, name in OPERATION.findall(header) if owner == module.name]
     lines = []
     for name, fields in structs.items():
-        shown = [f for f in fields if f.out] if name.endswith("_call") else fields
+        call = name.endswith("_call")
+        shown = [f for f in fields if f.out and name.removesuffix("_call") in owned] if call else fields
         if shown:
             lines += ["", f"class {name}(Structure):"]
             lines += [f"    {f.name}: {'int | None' if f.pointer else ONE.get(f.kind, 'int')}" for f in shown]
-    for owner, name in OPERATION.findall(header):
-        if owner != module.name:
-            continue
+    for name in owned:
         fields = structs[f"{name}_call"]
         counts = counts_of(fields)
         lines += [*([""] if not lines or lines[-1][:1] == " " else []), f"def {name}(", "    *,"]

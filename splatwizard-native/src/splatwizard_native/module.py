@@ -16,6 +16,7 @@ import importlib.util
 import itertools
 import logging
 import platform
+import re
 import shutil
 import sys
 import tempfile
@@ -158,8 +159,10 @@ class NativeModule:
 
     @property
     def face_header(self) -> str:
-        """Return the text of the header that C and Python read."""
-        return (self._root() / self.face).read_text("utf-8")
+        """Return the text of the header that C and Python read, with that of the package's own that it includes."""
+        path = self._root() / self.face
+        included = lambda found: (path.parent / found[1]).read_text("utf-8")  # noqa: E731
+        return re.sub(r'^#include "(.+)"$', included, path.read_text("utf-8"), flags=re.MULTILINE)
 
     def available(self, *, cuda: bool = False) -> str | None:
         """The reason why `load` would fail, or with `cuda` give no CUDA kernels; or None.

@@ -9,7 +9,7 @@ GAUSSIANS_CUDA = NativeModule(
     package="sw_gaussians",
     face="kernels/cuda/face.h",
     sources=("kernels/cuda/face.cpp",),
-    headers=("kernels/cuda/*.h",),
+    headers=("kernels/face.h", "kernels/cuda/*.h"),
     cuda_sources=("kernels/cuda/statistics.cu", "kernels/cuda/sparse_adam.cu", "kernels/cuda/disagreement.cu"),
     without="sparse Adam, gradient statistics and normal losses run on torch operations: the same numbers, slower",
 )

@@ -1,4 +1,4 @@
-"""The operations of kernels/face.h on a GPU."""
+"""The operations of kernels/cuda/face.h on a GPU."""
 
 from __future__ import annotations
 

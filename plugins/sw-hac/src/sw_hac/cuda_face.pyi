@@ -1,4 +1,4 @@
-"""Types of kernels/face.h, written by tools/make_faces.py."""
+"""Types of kernels/cuda/face.h, written by tools/make_faces.py."""
 
 from ctypes import Array, Structure
 from typing import Any

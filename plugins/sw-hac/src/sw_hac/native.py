@@ -7,7 +7,7 @@ from splatwizard_native import NativeModule
 HAC_CUDA = NativeModule(
     name="sw_hac_cuda",
     package="sw_hac",
-    face="kernels/face.h",
+    face="kernels/cuda/face.h",
     sources=("kernels/cuda/face.cpp",),
     headers=("kernels/face.h", "kernels/calls.h", "kernels/mixture.h", "kernels/cuda/*.h"),
     cuda_sources=("kernels/cuda/mixture.cu",),

@@ -17,7 +17,7 @@ class adam_update(Structure):
     eps: float
     step: int
 
-def photometric(
+def photometric_loss(
     *,
     x: Tensor | Array[Any] | int,
     y: Tensor | Array[Any] | int,
@@ -36,7 +36,7 @@ def photometric(
     sum_count: int | None = None,
     device: int | None = None,
 ) -> Structure: ...
-def photometric_backward(
+def photometric_loss_backward(
     *,
     x: Tensor | Array[Any] | int,
     y: Tensor | Array[Any] | int,

@@ -105,7 +105,7 @@ class _PhotometricOnCuda(torch.autograd.Function):
         image, target, slopes = ctx.saved_tensors
         valid, l1_weight, ssim_weight = ctx.weights
         grad = torch.empty_like(image)
-        cuda_face.photometric_backward(
+        cuda_face.photometric_loss_backward(
             x=image, y=target, slopes=slopes, valid=valid, l1_weight=l1_weight, ssim_weight=ssim_weight, scale=scale,
             grad=grad,
         )  # fmt: skip
@@ -123,7 +123,7 @@ def _means(
     total, l1, similarity = image.new_empty(()), image.new_empty(()), image.new_empty(())
     planes, height, width = image.shape
     blocks = planes * -(-height // TILE) * -(-width // TILE)
-    cuda_face.photometric(
+    cuda_face.photometric_loss(
         x=image, y=target, valid=weights[0], l1_weight=weights[1], ssim_weight=weights[2], offset=offset, total=total,
         l1=l1, ssim=similarity, slopes=slopes, sums=image.new_empty(2 + 2 * blocks),
     )  # fmt: skip

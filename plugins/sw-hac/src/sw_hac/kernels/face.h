@@ -1,4 +1,4 @@
-// The kernels of HAC, on the CPU and on a GPU: what C and Python call. See <splatwizard/c_face.h> for the form.
+// The kernels of HAC: what C and Python call. See <splatwizard/c_face.h> for the form.
 #pragma once
 #include <splatwizard/c_face.h>
 
@@ -27,7 +27,6 @@ typedef struct {
   float* to_second;             // [count, 3 * features] or null
 } mixture_bits_call;
 SW_OPERATION(sw_hac, mixture_bits);
-SW_OPERATION(sw_hac_cuda, mixture_bits);
 
 // Inputs of the networks of channels.
 typedef struct {
@@ -42,7 +41,6 @@ typedef struct {
   int64_t columns;
 } channel_inputs_call;
 SW_OPERATION(sw_hac, channel_inputs);
-SW_OPERATION(sw_hac_cuda, channel_inputs);
 
 // Derivatives by x and outputs from those of the bits, among them what comes through the networks of channels.
 typedef struct {
@@ -59,4 +57,3 @@ typedef struct {
   float* to_outputs;            // [count, width]
 } channel_slopes_call;
 SW_OPERATION(sw_hac, channel_slopes);
-SW_OPERATION(sw_hac_cuda, channel_slopes);

@@ -1,26 +1,8 @@
 // The kernels of training Gaussians on a GPU: what C and Python call. See <splatwizard/c_face.h> for the form.
 #pragma once
-#include <splatwizard/c_face.h>
+#include "../face.h"
 
-// One parameter with its gradient and moments, [rows, width] without gaps, which start at multiples of 16 bytes, and the
-// constants of its update.
-typedef struct {
-  float* param;
-  const float* grad;
-  float* exp_avg;
-  float* exp_avg_sq;
-  int64_t width;          // below 2^20
-  double lr, beta1, beta2, eps;
-} sparse_update;
-
-// One step of Adam, without bias correction, of the rows of all that are marked; 16 in a launch.
-typedef struct {
-  sw_head head;
-  const sparse_update* updates;
-  int64_t count;
-  const bool* marked;     // [rows]
-  int64_t rows;
-} sparse_adam_call;
+// One step of Adam, 16 tensors in a launch, which start at multiples of 16 bytes; rows are shorter than 2^20.
 SW_OPERATION(splatwizard_gaussians_cuda, sparse_adam);
 
 // Adds one view to the statistics of adaptive density control; Gaussians with radius 0 are left alone.

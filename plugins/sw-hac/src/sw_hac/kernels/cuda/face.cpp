@@ -1,4 +1,5 @@
-// The operations of ../face.h on a GPU.
+#include "face.h"
+
 #include <splatwizard/cuda_face.h>
 
 #include "../calls.h"

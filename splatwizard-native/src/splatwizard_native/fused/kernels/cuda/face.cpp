@@ -28,7 +28,7 @@ kernels::Photometric photometric_of(const Call& call) {
 
 }  // namespace
 
-SW_OPERATION(splatwizard_training_cuda, photometric) {
+SW_OPERATION(splatwizard_training_cuda, photometric_loss) {
   return guarded_on_gpu(call, [&](cudaStream_t stream) {
     kernels::Photometric args = photometric_of(*call);
     args.offset = call->offset, args.slopes = call->slopes;
@@ -41,7 +41,7 @@ SW_OPERATION(splatwizard_training_cuda, photometric) {
   });
 }
 
-SW_OPERATION(splatwizard_training_cuda, photometric_backward) {
+SW_OPERATION(splatwizard_training_cuda, photometric_loss_backward) {
   return guarded_on_gpu(call, [&](cudaStream_t stream) {
     kernels::Photometric args = photometric_of(*call);
     args.slopes = const_cast<float*>(call->slopes);

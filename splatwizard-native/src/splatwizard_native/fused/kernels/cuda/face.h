@@ -1,6 +1,6 @@
 // The fused operations of training on a GPU: what C and Python call. See <splatwizard/c_face.h> for the form.
 #pragma once
-#include <splatwizard/c_face.h>
+#include "../face.h"
 
 // total = offset + l1_weight * l1 + ssim_weight * ssim of two images; the host waits for none of them.
 typedef struct {
@@ -16,22 +16,22 @@ typedef struct {
   float* slopes;          // [3, planes, height, width] or null: what the backward pass needs
   float* sums;            // [sum_count] scratch: two, and two for each 32 x 32 pixels of each plane, or more
   int64_t sum_count;
-} photometric_call;
-SW_OPERATION(splatwizard_training_cuda, photometric);
+} photometric_loss_call;
+SW_OPERATION(splatwizard_training_cuda, photometric_loss);
 
 // The gradient of a loss by x, from that by `total`.
 typedef struct {
   sw_head head;
   const float* x;         // [planes, height, width]
   const float* y;         // [planes, height, width]
-  const float* slopes;    // [3, planes, height, width] of `photometric` with the same images and weights
+  const float* slopes;    // [3, planes, height, width] of `photometric_loss` with the same images and weights
   int64_t planes, height, width;
   bool valid;
   double l1_weight, ssim_weight;
   const float* scale;     // one number
   float* grad;            // [planes, height, width]
-} photometric_backward_call;
-SW_OPERATION(splatwizard_training_cuda, photometric_backward);
+} photometric_loss_backward_call;
+SW_OPERATION(splatwizard_training_cuda, photometric_loss_backward);
 
 // exp of log scales, sigmoid of opacity logits.
 typedef struct {
@@ -57,22 +57,5 @@ typedef struct {
 } activate_backward_call;
 SW_OPERATION(splatwizard_training_cuda, activate_backward);
 
-// One parameter with its gradient and state, `count` contiguous numbers each, which start at multiples of 16 bytes, and
-// the constants of its update.
-typedef struct {
-  float* param;
-  const float* grad;
-  float* exp_avg;
-  float* exp_avg_sq;
-  int64_t count;
-  double lr, beta1, beta2, eps;
-  int64_t step;           // of this update, from 1
-} adam_update;
-
-// One step of Adam of all, 24 in a launch.
-typedef struct {
-  sw_head head;
-  const adam_update* updates;
-  int64_t count;
-} adam_call;
+// One step of Adam of all, 24 in a launch; tensors start at multiples of 16 bytes.
 SW_OPERATION(splatwizard_training_cuda, adam);
