@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -68,66 +69,39 @@ class _Photometric(torch.autograd.Function):
         return scaled, None, None, None, None, None
 
 
-def _on_cuda(
-    x: Tensor, y: Tensor, valid: bool, l1_weight: float, ssim_weight: float, offset: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    if torch.is_grad_enabled() and x.requires_grad:
-        found: tuple[Tensor, Tensor, Tensor] = _PhotometricOnCuda.apply(  # type: ignore[no-untyped-call]
-            x, y, valid, l1_weight, ssim_weight, offset
-        )
-        return found
-    image, target = _planes(x), _planes(y)
-    return _means(image, target, (valid, l1_weight, ssim_weight), offset, None)
-
-
 class _PhotometricOnCuda(torch.autograd.Function):
     """As `_Photometric`, without waiting for a number; the gradient is put together when its scale is known."""
 
     @staticmethod
     def forward(
-        ctx: Any, x: Tensor, y: Tensor, valid: bool, l1_weight: float, ssim_weight: float, offset: float
-    ) -> tuple[Tensor, Tensor, Tensor]:
+        ctx: Any, learns: bool, x: Tensor, y: Tensor, valid: bool, l1_weight: float, ssim_weight: float, offset: float
+    ) -> tuple[Tensor, ...]:
         image, target = _planes(x), _planes(y)
-        slopes = image.new_empty(3, *image.shape)
-        ctx.weights = valid, l1_weight, ssim_weight
-        total, l1, similarity = _means(image, target, ctx.weights, offset, slopes)
+        planes, height, width = image.shape
+        # Each a tensor of its own: views of one could not be changed in place.
+        total, l1, similarity = found = tuple(image.new_empty(()) for _ in range(3))
+        slopes = image.new_empty(3, *image.shape) if learns else None
+        ctx.weights = {"valid": valid, "l1_weight": l1_weight, "ssim_weight": ssim_weight}
+        cuda_face.photometric_loss(
+            x=image, y=target, **ctx.weights, offset=offset, total=total, l1=l1, ssim=similarity, slopes=slopes,
+            sums=image.new_empty(2 + 2 * planes * -(-height // TILE) * -(-width // TILE)),
+        )  # fmt: skip
         ctx.mark_non_differentiable(l1, similarity)
-        ctx.set_materialize_grads(False)
         ctx.save_for_backward(image, target, slopes)
         ctx.shape = x.shape
-        return total, l1, similarity
+        return found
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, scale: Tensor | None, *_: Tensor | None) -> tuple[Tensor | None, ...]:
-        if scale is None:
-            return (None,) * 6
+    def backward(ctx: Any, scale: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
         image, target, slopes = ctx.saved_tensors
-        valid, l1_weight, ssim_weight = ctx.weights
         grad = torch.empty_like(image)
-        cuda_face.photometric_loss_backward(
-            x=image, y=target, slopes=slopes, valid=valid, l1_weight=l1_weight, ssim_weight=ssim_weight, scale=scale,
-            grad=grad,
-        )  # fmt: skip
-        return grad.view(ctx.shape), None, None, None, None, None
+        cuda_face.photometric_loss_backward(x=image, y=target, slopes=slopes, **ctx.weights, scale=scale, grad=grad)
+        return None, grad.view(ctx.shape), *[None] * 5
 
 
 def _planes(x: Tensor) -> Tensor:
     return x.reshape(-1, *x.shape[-2:]).contiguous()
-
-
-def _means(
-    image: Tensor, target: Tensor, weights: tuple[bool, float, float], offset: float, slopes: Tensor | None
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Total, L1 and SSIM on CUDA, each a tensor of its own: views of one could not be changed in place."""
-    total, l1, similarity = image.new_empty(()), image.new_empty(()), image.new_empty(())
-    planes, height, width = image.shape
-    blocks = planes * -(-height // TILE) * -(-width // TILE)
-    cuda_face.photometric_loss(
-        x=image, y=target, valid=weights[0], l1_weight=weights[1], ssim_weight=weights[2], offset=offset, total=total,
-        l1=l1, ssim=similarity, slopes=slopes, sums=image.new_empty(2 + 2 * blocks),
-    )  # fmt: skip
-    return total, l1, similarity
 
 
 def ssim_map(x: Tensor, y: Tensor, padding: Padding = "same") -> Tensor:
@@ -154,5 +128,6 @@ def _fused(x: Tensor, y: Tensor) -> Callable[..., tuple[Tensor, Tensor, Tensor]]
     if x.dtype != torch.float32 or y.requires_grad:
         return None
     if x.is_cuda:
-        return _on_cuda if TRAINING.has_cuda() else None
+        learns = torch.is_grad_enabled() and x.requires_grad
+        return partial(_PhotometricOnCuda.apply, learns) if TRAINING.has_cuda() else None
     return _Photometric.apply if x.device.type == "cpu" and TRAINING.try_load() else None
