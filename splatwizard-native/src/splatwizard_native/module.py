@@ -278,6 +278,9 @@ class NativeModule:
                 return
         except NativeBuildError as error:
             log.warning("%s; it is compiled anew", error)
+        missing = cuda_toolkit.toolkit_mismatch() if self.cuda_sources else None
+        if missing is not None:
+            raise self._failure(missing)
         library = self.build(force=self.is_built("native"), say=say)
         problem = self._open(library)
         if problem is not None:
@@ -359,9 +362,6 @@ class NativeModule:
 
     def _compile(self, library: Path, march: str, tools: Toolchain, say: Say, force: bool) -> None:
         say(f"compiling kernels '{self.name}' (once) ...")
-        missing_toolkit = cuda_toolkit.toolkit_mismatch() if self.cuda_sources else None
-        if missing_toolkit is not None:
-            raise NativeBuildError(missing_toolkit)
         started = time.monotonic()
         build_log = library.with_suffix(".log")
         build_log.unlink(missing_ok=True)
