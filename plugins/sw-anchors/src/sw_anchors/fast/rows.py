@@ -92,7 +92,7 @@ def gathered(rows: Tensor, tensors: Sequence[Tensor]) -> list[Tensor]:
 
 
 class Way(IntEnum):
-    """How `_copy` goes: `way` of kernels/cuda/face.h."""
+    """Direction of `_copy`: `way` of kernels/cuda/face.h."""
 
     GATHER = 0
     SCATTER = 1
