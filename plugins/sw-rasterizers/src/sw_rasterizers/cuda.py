@@ -177,7 +177,9 @@ def project_backward(
     maps        whether rows hold sums of maps
     """
     call, means = picture.call, tensors["means"]
-    done = {name: u for name, u in (updates or {}).items() if name in wanted}
+    # Only of the tensors that were drawn, not of copies of them.
+    offered = {name: u for name, u in (updates or {}).items() if name in wanted}
+    done = {name: u for name, u in offered.items() if tensors[name].data_ptr() == u.param.data_ptr()}
     wanted = set(wanted) - set(done)
     # Rows of shared shapes are summed up.
     shared = {"scales", "quats"} if call.geom_indices is not None else set()
