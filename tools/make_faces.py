@@ -41,13 +41,15 @@ def stub(path: Path) -> str:
     module = importlib.import_module(module_of(path)).MODULE
     header = module.face_header
     structs = read_structs(header)
+    owned = [name for owner, name in OPERATION.findall(header) if owner == module.name]
     lines = []
     for name, fields in structs.items():
-        shown = [f for f in fields if f.out] if name.endswith("_call") else fields
+        call = name.endswith("_call")
+        shown = [f for f in fields if f.out and name.removesuffix("_call") in owned] if call else fields
         if shown:
             lines += ["", f"class {name}(Structure):"]
             lines += [f"    {f.name}: {'int | None' if f.pointer else ONE.get(f.kind, 'int')}" for f in shown]
-    for _, name in OPERATION.findall(header):
+    for name in owned:
         fields = structs[f"{name}_call"]
         counts = counts_of(fields)
         lines += [*([""] if not lines or lines[-1][:1] == " " else []), f"def {name}(", "    *,"]
@@ -55,6 +57,7 @@ def stub(path: Path) -> str:
             may_be_left_out = f.optional or f.name in counts
             if not f.out:
                 lines.append(f"    {f.name}: {kind_of(f)}{' | None = None' * may_be_left_out},")
+        lines += ["    device: int | None = None,"] if module.cuda_sources else []
         lines.append(f") -> {f'{name}_call' if any(f.out for f in fields) else 'Structure'}: ...")
     body = "\n".join(lines)
     words = set(re.findall(r"\w+", body))

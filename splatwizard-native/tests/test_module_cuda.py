@@ -1,5 +1,6 @@
 """CUDA sources: when they are compiled, for which GPUs, and what is said where they cannot be."""
 
+import importlib
 import json
 import re
 from pathlib import Path
@@ -7,36 +8,27 @@ from pathlib import Path
 import pytest
 from native_package import digest_of, needs_compiler
 
-from splatwizard_native import cuda_toolkit, toolchain
+from splatwizard_native import NativeBuildError, cuda_toolkit, toolchain
 
 CUDA_KERNEL = """
 #include "value.h"
-#ifndef SW_WITH_CUDA
-#error "not told about CUDA"
-#endif
 __global__ void fill(int* out) { out[threadIdx.x] = VALUE; }
 """
-
-
-def test_cuda_sources_are_left_out_without_cuda_in_torch(package):
-    import torch
-
-    if torch.version.cuda is not None:
-        pytest.skip("this torch has CUDA")
-    package.write("fill.cu", CUDA_KERNEL)
-    module = package.module(cuda_sources=("fill.cu",))
-    assert module.key("native") == package.module().key("native")
-    assert module.state()["target"] == "cpu"
 
 
 def test_nothing_is_compiled_for_a_gpu_where_no_cuda_kernels_can_be_built(package, monkeypatch, caplog):
     package.write("fill.cu", CUDA_KERNEL)
     monkeypatch.setattr(cuda_toolkit, "toolkit_mismatch", lambda: "there is no toolkit")
-    module = package.module(cuda=package.module(cuda_sources=("fill.cu",)))
+    of_gpu = package.module(cuda_sources=("fill.cu",))
+    module = package.module(cuda=of_gpu)
     assert not module.has_cuda()
     assert not module.has_cuda()
-    assert package.compilations == 0
     assert caplog.messages == ["kernels 'answer' have no CUDA part: there is no toolkit; answers are guessed"]
+    with pytest.raises(NativeBuildError, match="there is no toolkit"):
+        of_gpu.load()
+    assert package.compilations == 0
+    assert package.module().available(cuda=True) == "module 'answer' has no CUDA kernels"
+    assert not package.module().has_cuda()
 
 
 @needs_compiler
@@ -46,13 +38,14 @@ def test_cuda_sources_are_compiled_for_each_architecture(package, monkeypatch, t
 
     package.write("fill.cu", CUDA_KERNEL)
     module = package.module(cuda_sources=("fill.cu",))
-    before = module.key("native")
     monkeypatch.setattr(torch.version, "cuda", torch.version.cuda or "13.0")
     monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "8.0 9.0")
-    assert module.state()["target"] == "cuda"
+    before = module.key("native")
+    monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "8.0 9.0+PTX")
     assert module.key("native") != before
+    assert module.state()["target"] == "cuda"
     (job,) = [job for job in module._jobs("native", tmp_path) if job.cuda]
-    assert {"-gencode=arch=compute_80,code=sm_80", "-gencode=arch=compute_90,code=sm_90"} <= set(job.flags)
+    assert {"-gencode=arch=compute_80,code=sm_80", "-gencode=arch=compute_90,code=compute_90"} <= set(job.flags)
     toolchain.Toolchain().compile([job], tmp_path / "log")
     assert job.output.stat().st_size > 0
     assert (package.folder / "value.h") in toolchain.read_dependencies(Path(f"{job.output}.d"))
@@ -70,7 +63,7 @@ def test_cuda_sources_are_compiled_for_each_architecture(package, monkeypatch, t
 def test_a_cuda_toolkit_that_does_not_fit_torch_is_named(package, monkeypatch, torchs, nvcc, message):
     import torch
 
-    module = package.module(cuda_sources=("fill.cu",))
+    module = package.module(cuda=package.module(cuda_sources=("fill.cu",)))
     monkeypatch.setattr(torch.version, "cuda", torchs)
     monkeypatch.setattr(cuda_toolkit, "find_nvcc", lambda: None if nvcc is None else "/opt/cuda/bin/nvcc")
     monkeypatch.setattr(cuda_toolkit, "nvcc_version", lambda _: nvcc)
@@ -81,21 +74,84 @@ def test_a_cuda_toolkit_that_does_not_fit_torch_is_named(package, monkeypatch, t
     else:
         assert reason is not None
         assert re.search(message, reason)
-    assert module.state()["target"] == ("cpu" if message else "cuda")
+
+
+GPU_FACE = """
+#include <splatwizard/c_face.h>
+typedef struct {
+  sw_head head;
+  const float* x;  // [count]
+  int64_t count;
+  int64_t refused;
+} look_call;
+SW_OPERATION(answer, look);
+"""
+GPU_SOURCE = """
+#include "face.h"
+#include <splatwizard/cuda_face.h>
+void look(const float* x, int count, cudaStream_t stream);
+SW_OPERATION(answer, look) {
+  return splatwizard::guarded_on_gpu(call, [&](cudaStream_t stream) {
+    if (call->refused) splatwizard::refuse("%lld is refused", (long long)call->refused);
+    look(call->x, int(call->count), stream);
+  });
+}
+"""
+GPU_KERNEL = """
+#include <cuda_runtime_api.h>
+__global__ void kernel(const float* x) {}
+void look(const float* x, int count, cudaStream_t stream) { kernel<<<count, 1, 0, stream>>>(x); }
+"""
 
 
 @needs_compiler
-def test_a_packaged_cuda_library_is_used_without_a_cuda_compiler_if_it_fits_the_gpu(package, monkeypatch):
+@pytest.mark.skipif(cuda_toolkit.find_nvcc() is None, reason="no CUDA compiler on this machine")
+def test_a_face_for_gpus_is_built_without_torch_and_tells_cudas_errors(package, monkeypatch):
+    import torch
+
+    from splatwizard_native import face
+    from splatwizard_native.face_operations import operations
+
+    package.write("face.h", GPU_FACE)
+    package.write("answer.cpp", GPU_SOURCE)
+    package.write("kernel.cu", GPU_KERNEL)
+    package.write("offered.py", "")
+    monkeypatch.setattr(torch.version, "cuda", torch.version.cuda or "13.0")
+    monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "9.0")
+    monkeypatch.setattr(face, "current_stream", lambda device: 0)
+    module = package.module(cuda_sources=("kernel.cu",), face="face.h")
+    module.load()
+    assert module.state()["state"] == "built"
+    log = module.build().with_suffix(".log").read_text()
+    assert "/torch/" not in log
+    assert "-lcudart_static" in log
+    offered = importlib.import_module(f"{package.folder.name}.offered")
+    offered.__getattr__ = operations(module, offered.__name__)
+    with pytest.raises(RuntimeError, match=r"look: x must be .* on the GPU, got .* on cpu"):
+        offered.look(x=torch.zeros(3), refused=0)
+    with pytest.raises(RuntimeError, match=r"look: x must be .* on the GPU, got .* on cpu"):
+        offered.look(x=torch.zeros(3), refused=0, device=0)
+    with pytest.raises(RuntimeError, match=r"^look: CUDA: \w+|^look: 1 is refused$"):  # there may be a GPU
+        offered.look(x=0, count=1, refused=1, device=0)
+
+
+@needs_compiler
+def test_a_packaged_cuda_library_is_used_without_a_cuda_compiler_if_it_fits_the_gpu(package, monkeypatch, tmp_path):
+    """It lies in the distribution for the CUDA of torch; one of another version of the sources has another name."""
     import torch
 
     package.write("fill.cu", CUDA_KERNEL)
     module = package.module(cuda_sources=("fill.cu",))
     monkeypatch.setattr(torch.version, "cuda", "13.0")
     monkeypatch.setattr(cuda_toolkit, "find_nvcc", lambda: None)
-    library = module._library(module.prebuilt_folder, "portable", True)
-    library.parent.mkdir()
+    assert module.prebuilt_folder == package.folder / "prebuilt"
+    shipped = tmp_path / "shipped" / "splatwizard_cuda13" / "prebuilt"
+    shipped.mkdir(parents=True)
+    (shipped.parent / "__init__.py").write_text("")
+    monkeypatch.syspath_prepend(str(tmp_path / "shipped"))
+    library = shipped / module.prebuilt_name("portable")
     library.write_bytes(b"not looked into")
-    facts = {"sha256": digest_of(library), "architectures": ["8.0", "9.0", "12.0a"]}
+    facts = {"sha256": digest_of(library), "architectures": ["8.0", "9.0", "12.0a", "12.5+PTX"]}
     library.with_suffix(".json").write_text(json.dumps(facts))
     for gpu, suits in (
         ((9, 0), True),
@@ -104,7 +160,12 @@ def test_a_packaged_cuda_library_is_used_without_a_cuda_compiler_if_it_fits_the_
         ((10, 0), False),
         ((12, 0), True),
         ((12, 1), False),
+        ((12, 8), True),
+        ((13, 0), True),
     ):
         monkeypatch.setattr(cuda_toolkit, "gpus", lambda gpu=gpu: [gpu])
         assert (library in module._existing()) == suits
-        assert (module.available(cuda=True) is None) == suits
+        assert (module.available() is None) == suits
+    assert module.state()["state"] == "prebuilt"
+    package.write("fill.cu", CUDA_KERNEL + "// changed\n")
+    assert not list(module._existing())

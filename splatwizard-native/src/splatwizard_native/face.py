@@ -85,11 +85,15 @@ def structure(name: str, fields: list[Field], *, call: bool = False) -> Any:
     return type(name, (ctypes.Structure,), {"_fields_": [*(HEAD if call else ()), *listed]})
 
 
-def operation(name: str, fields: list[Field], function: Any, told: Callable[[], bytes], run: int | None) -> Any:
+def operation(
+    name: str, fields: list[Field], function: Any, told: Callable[[], bytes], run: int | None, *, on_gpu: bool = False
+) -> Any:
     """Return a Python function of the fields by name, which calls `function` and returns the struct with its results.
 
     told    gives the text of the library's last error
     run     address of what runs loops on threads
+    on_gpu  tensors are on one GPU, and the work goes to its current stream: that of the first tensor, which the
+            keyword `device` tells where none is handed over
 
     A pointer takes a tensor, a ctypes array, an address, or None where the header says so. RuntimeError for what does
     not fit the header, and with the library's text if it refuses.
@@ -101,28 +105,40 @@ def operation(name: str, fields: list[Field], function: Any, told: Callable[[], 
         kind = NUMBERS.get(field.kind, (field.kind,))[0]
         raise RuntimeError(
             f"{name}: {field.name} must be a {'' if field.strided else 'contiguous '}{kind} tensor "
-            f"{f'[{shape}] ' if shape else ''}on the CPU, got {value.dtype} {list(value.shape)} on {value.device}"
+            f"{f'[{shape}] ' if shape else ''}on the {'GPU' if on_gpu else 'CPU'}, "
+            f"got {value.dtype} {list(value.shape)} on {value.device}"
         )
 
     # With an underscore, as no field begins: fields are the arguments.
     known = {
         "_torch": torch, "_Tensor": torch.Tensor, "_threads": torch.get_num_threads, "_addressof": ctypes.addressof,
-        "_byref": ctypes.byref, "_fields": fields, "_refuse": refuse, "_function": function, "_told": told,
+        "_byref": ctypes.byref, "_stream": current_stream, "_fields": fields, "_refuse": refuse,
+        "_function": function, "_told": told,
         "_struct": structure(f"{name}_call", fields, call=True),
         "_pointers": lambda field: ctypes.c_void_p * field.length,
         "_numbers": lambda field: NUMBERS[field.kind][1] * field.length,
     }  # fmt: skip
     # As dataclasses are made: a loop over the fields took three times as long.
-    exec(compile(_source(name, fields, run), f"<{name}>", "exec"), known)
+    exec(compile(_source(name, fields, run, on_gpu), f"<{name}>", "exec"), known)
     return known[name]
 
 
-def _source(name: str, fields: list[Field], run: int | None) -> str:
+def current_stream(device: int) -> int:
+    """Return the handle of the stream on which torch works on a GPU."""
+    import torch
+
+    # The public way makes an object of it, and takes ten times as long.
+    stream: int = torch._C._cuda_getCurrentRawStream(device)
+    return stream
+
+
+def _source(name: str, fields: list[Field], run: int | None, on_gpu: bool) -> str:
     """Return the code of an operation: counts from shapes, then a check of each tensor, then the call."""
     counts = counts_of(fields)
     free = {size for f in fields for size in f.shape or () if size.isidentifier()} - {f.name for f in fields}
     bind, check, values = [f"{size} = None" for size in sorted(free)], [], []
     unknown = counts | free
+    elsewhere = "not _one.is_cuda or _one.get_device() != device" if on_gpu else "not _one.is_cpu"
     for i, field in enumerate(fields):
         x = field.name
         if not field.pointer:
@@ -131,7 +147,7 @@ def _source(name: str, fields: list[Field], run: int | None) -> str:
             continue
         # The arguments keep what they name alive until the call has returned; addresses have names of their own.
         one, at, indent = (x, f"_at_{x}", "") if field.length is None else ("_one", f"_at_{x}[_i]", "    ")
-        tests = [f"not {one}.is_cpu", *([] if field.strided else [f"not {one}.is_contiguous()"])]
+        tests = [elsewhere.replace("_one", one), *([] if field.strided else [f"not {one}.is_contiguous()"])]
         if field.kind in NUMBERS:
             tests.append(f"{one}.dtype is not _torch.{NUMBERS[field.kind][0]}")
         if field.kind == "sw_real":
@@ -148,6 +164,7 @@ def _source(name: str, fields: list[Field], run: int | None) -> str:
             check += [f"_at_{x} = _pointers(_fields[{i}])()", f"for _i, _one in enumerate({x}):"]
         check += [
             f"{indent}if isinstance({one}, _Tensor):",
+            *([f"{indent}    if device is None: device = {one}.get_device()"] if on_gpu else []),
             f"{indent}    if {' or '.join(tests)}: _refuse(_fields[{i}], {one}, locals())",
             f"{indent}    {at} = {one}.data_ptr()",
         ]
@@ -156,9 +173,11 @@ def _source(name: str, fields: list[Field], run: int | None) -> str:
             check.append(f"else: {at} = {x} if {passed} else _addressof({x})")
         values.append(f"_at_{x}")
     arguments = [f"{f.name}=None" if f.optional or f.out or f.name in counts else f.name for f in fields]
+    where = "1, device, _stream(device)" if on_gpu else "_threads(), -1, None"
     size = ctypes.sizeof(structure(name, fields, call=True))
     code = [
-        *bind, *check, f"_call = _struct({size}, {ABI}, _threads(), -1, None, {run}, {', '.join(values)})",
+        *bind, *check, f"_call = _struct({size}, {ABI}, {where}, {run}, {', '.join(values)})",
         f"if _function(_byref(_call)) != 0: raise RuntimeError(f'{name}: {{_told().decode()}}')", "return _call",
     ]  # fmt: skip
+    arguments += ["device=None"] if on_gpu else []
     return "\n    ".join([f"def {name}(*, {', '.join(arguments)}):", *code])

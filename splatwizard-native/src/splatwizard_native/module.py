@@ -1,6 +1,6 @@
 """Native modules: C++ and CUDA sources that ship with a package, found prebuilt, cached, or compiled on first use.
 
-A module has a plain C face (docs/native.md), or registers ops with TORCH_LIBRARY.
+A module has a plain C face (docs/native.md): no torch is in it, so that one binary serves every version.
 Environment: SPLATWIZARD_CACHE (where builds go), SPLATWIZARD_NATIVE=0 (do without native code),
 SPLATWIZARD_BUILD_TIMEOUT (seconds to wait for another process's build), CXX, CUDA_HOME, TORCH_CUDA_ARCH_LIST (compute
 capabilities to build for, as "8.0;9.0"; without it those of the GPUs here), MAX_JOBS.
@@ -8,14 +8,15 @@ capabilities to build for, as "8.0;9.0"; without it those of the GPUs here), MAX
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
 import hashlib
-import importlib.metadata
 import importlib.util
 import itertools
 import logging
 import platform
+import re
 import shutil
 import sys
 import tempfile
@@ -28,7 +29,7 @@ from typing import Any
 from splatwizard_native import cuda_toolkit, toolchain
 from splatwizard_native.errors import NativeBuildError
 from splatwizard_native.face import ABI, OPERATION
-from splatwizard_native.library import architectures_of, fetch, install, is_intact, keep, load_ops, open_face
+from splatwizard_native.library import architectures_of, fetch, install, is_intact, keep, open_face
 from splatwizard_native.lock import build_lock
 from splatwizard_native.settings import SWITCHED_OFF, build_timeout, cache_root, switched_off
 from splatwizard_native.toolchain import Job, Toolchain
@@ -45,8 +46,7 @@ Say = Callable[[str], None]
 class _Session:
     """State of a module in this process, shared by all: a loaded library cannot be unloaded.
 
-    library what was loaded, if it has a plain C face
-    cuda    whether it holds CUDA kernels; None: nobody has asked yet
+    cuda    whether its module for GPUs is loaded; None: nobody has asked yet
     """
 
     loaded: Path | None = None
@@ -62,13 +62,12 @@ class NativeModule:
 
     name            of the library's file; what C functions of a face begin with
     package         import package whose folder the paths below are relative to
-    sources         C++ files compiled once: the binding file, or what stands behind the face
-    kernels         C++ files compiled once per instruction set, in `namespace SW_ARCH` (<splatwizard/dispatch.h>);
-                    they see no torch header
+    sources         C++ files compiled once: what stands behind the face
+    kernels         C++ files compiled once per instruction set, in `namespace SW_ARCH` (<splatwizard/dispatch.h>)
     headers         every header that the files above include from the package; globs are allowed
-    face            header of a plain C face (<splatwizard/c_face.h>): one binary for any torch; none: torch ops
-    cuda            torch ops of a module with a face for tensors on a GPU, as a library of its own
-    cuda_sources    .cu files, compiled (with SW_WITH_CUDA defined everywhere) only if torch has CUDA and nvcc is there
+    face            header of the operations (<splatwizard/c_face.h>)
+    cuda            the module of the same operations on a GPU
+    cuda_sources    .cu files: this is a module for GPUs, compiled by nvcc, and only where torch has CUDA
     cflags          more flags for sources and kernels
     without         what happens without this module, told to the user when it cannot be built
     """
@@ -115,15 +114,13 @@ class NativeModule:
         return True
 
     def has_cuda(self) -> bool:
-        """Load CUDA kernels, and say whether there are such; if not, warn once. For code that has a torch fallback."""
-        if self.cuda is not None:
-            return self.cuda.has_cuda()
+        """Load the module for GPUs, and say whether there is one; if not, warn once. For code with a torch fallback."""
         session = self._session
-        if session.cuda is None and (session.loaded is not None or not switched_off()):
-            missing = self.available(cuda=True)  # asked first: a build without CUDA would be for nothing
-            session.cuda = missing is None and self.try_load() and bool(architectures_of(session.loaded))
-            if missing is not None and not session.warned:
-                log.warning("kernels '%s' have no CUDA part: %s; %s", self.name, missing, self.without)
+        if session.cuda is None and self.cuda is not None and not switched_off():
+            missing = self.cuda.available()  # asked first: nothing is compiled for nothing
+            session.cuda = missing is None and self.cuda.try_load()
+            if missing is not None:
+                log.warning("kernels '%s' have no CUDA part: %s; %s", self.name, missing, self.cuda.without)
         return bool(session.cuda)
 
     def load_built(self) -> bool:
@@ -151,37 +148,37 @@ class NativeModule:
 
     @property
     def library(self) -> ctypes.CDLL:
-        """Return the library of a module with a face, loaded now if it is not yet. Raises NativeBuildError."""
+        """Return the library, loaded now if it is not yet. Raises NativeBuildError."""
         self.load()
-        assert self._session.library is not None, f"'{self.name}' has no plain C face"
+        assert self._session.library is not None
         return self._session.library
 
     @property
     def face_header(self) -> str:
-        """Return the text of the header that C and Python read."""
-        return (self._root() / self.face).read_text("utf-8")
+        """Return the text of the header that C and Python read, with that of the package's own that it includes."""
+        path = self._root() / self.face
+        if not self.face:
+            return ""
+        included = lambda found: (path.parent / found[1]).read_text("utf-8")  # noqa: E731
+        return re.sub(r'^#include "(.+)"$', included, path.read_text("utf-8"), flags=re.MULTILINE)
 
     def available(self, *, cuda: bool = False) -> str | None:
-        """The reason why `load` would fail, or with `cuda` give no CUDA kernels; or None.
+        """The reason why `load` would fail, or with `cuda` that of its module for GPUs; or None.
 
         Compiles nothing: a compiler that is there is taken to work.
         """
         session = self._session
-        if cuda and self.cuda is not None:
-            return self.cuda.available(cuda=True)
+        if cuda:
+            return f"module '{self.name}' has no CUDA kernels" if self.cuda is None else self.cuda.available()
         if session.error is not None:
             return str(session.error)
         try:
-            found = session.loaded or next(self._existing(), None)
-            if cuda and not architectures_of(found):
-                if session.loaded is not None:
-                    return f"the kernels '{self.name}' that are loaded were built without CUDA: start again"
-                missing = self._without_cuda()
-                if missing is not None:
-                    return missing
             if session.loaded is None and switched_off():
                 return SWITCHED_OFF
-            if found is None:
+            if session.loaded is None and next(self._existing(), None) is None:
+                missing = cuda_toolkit.toolkit_mismatch() if self.cuda_sources else None
+                if missing is not None:
+                    return missing
                 toolchain.find_compiler()
         except NativeBuildError as error:
             return str(error)
@@ -197,8 +194,8 @@ class NativeModule:
             state = "prebuilt" if path.parent == self.prebuilt_folder else "built"
         else:
             state = "damaged" if any(library.exists() for library in self._places()) else "reference"
-        cuda = self._with_cuda() if path is None else bool(architectures_of(path))
-        return {"state": state, "path": None if path is None else str(path), "target": "cuda" if cuda else "cpu"}
+        target = "cuda" if self.cuda_sources else "cpu"
+        return {"state": state, "path": None if path is None else str(path), "target": target}
 
     def is_built(self, march: str, folder: Path | None = None) -> bool:
         """Whether `build` with these arguments would find the library there and undamaged."""
@@ -236,7 +233,13 @@ class NativeModule:
 
     @property
     def prebuilt_folder(self) -> Path:
-        """Folder where a wheel, or `sw build-kernels --portable`, puts the library."""
+        """Folder where a wheel, or `sw build-kernels --portable`, puts the library.
+
+        Those for GPUs are all in the distribution of the major version of CUDA that torch has, if it is installed.
+        """
+        if self.cuda_sources:
+            with contextlib.suppress(NativeBuildError):
+                return _folder_of(f"splatwizard_cuda{cuda_toolkit.major_of_torch()}") / "prebuilt"
         return self._root() / "prebuilt"
 
     @property
@@ -244,27 +247,18 @@ class NativeModule:
         """Folder of builds for this user."""
         return cache_root() / "native"
 
-    def key(self, march: str, cuda: bool | None = None, *, any_gpu: bool = False) -> str:
-        """Digest of all that the binary depends on: torch and CUDA if it uses them, the CPU if native, flags, sources.
-
-        cuda        with CUDA kernels or without; None: as a build here would be
-        any_gpu     leave the GPUs' architectures out: a binary in a package says itself which ones it holds
-        """
-        cuda = self._with_cuda() if cuda is None else cuda
-        torch = None if self.face else importlib.import_module("torch")  # a library with a face is built without it
-        # The empty flags at the two ends are those of linker and nvcc: modules had some, and older builds stay valid.
+    def key(self, march: str) -> str:
+        """Digest of all that the binary in the cache depends on: the CPU or the GPUs here, flags, sources."""
+        # The empty flags at the end are those of the linker: modules had some, and older builds stay valid.
         facts: list[object] = [
-            self.name, f"ABI {ABI}" if torch is None else str(torch.__version__), self._common_flags(),
-            platform.system(), platform.machine(), march,
+            self.name, f"ABI {ABI}", toolchain.plain_flags(), platform.system(), platform.machine(), march,
             toolchain.arch_variants(march), toolchain.cpu_identity() if march == "native" else "", self.cflags, (),
         ]  # fmt: skip
-        if cuda and torch is not None:
-            facts += [torch.version.cuda, () if any_gpu else cuda_toolkit.architectures(), ()]
-        return self._digest(facts, self._files(cuda))
+        return self._digest(facts + (cuda_toolkit.architectures() if self.cuda_sources else []), self._files())
 
     def source_hash(self) -> str:
-        """Digest of sources and flags, whatever compiles them: a library with a face tells it."""
-        return self._digest([self.name, ABI, self.cflags], self._files(False))
+        """Digest of sources and flags, whatever compiles them: the library tells it."""
+        return self._digest([self.name, ABI, self.cflags], self._files())
 
     def _digest(self, facts: list[object], files: Sequence[Path]) -> str:
         digest = hashlib.sha256(repr(facts).encode())
@@ -284,6 +278,9 @@ class NativeModule:
                 return
         except NativeBuildError as error:
             log.warning("%s; it is compiled anew", error)
+        missing = cuda_toolkit.toolkit_mismatch() if self.cuda_sources else None
+        if missing is not None:
+            raise self._failure(missing)
         library = self.build(force=self.is_built("native"), say=say)
         problem = self._open(library)
         if problem is not None:
@@ -291,14 +288,11 @@ class NativeModule:
 
     def _open(self, library: Path) -> str | None:
         """Load a library; the reason if that fails."""
-        if self.face:
-            symbols = [f"{module}_{operation}" for module, operation in OPERATION.findall(self.face_header)]
-            try:
-                self._session.library = open_face(library, self.name, self.source_hash(), symbols)
-            except OSError as error:
-                return str(error)
-        elif (problem := load_ops(library)) is not None:
-            return problem
+        symbols = [f"{module}_{op}" for module, op in OPERATION.findall(self.face_header) if module == self.name]
+        try:
+            self._session.library = open_face(library, self.name, self.source_hash(), symbols)
+        except OSError as error:
+            return str(error)
         self._session.loaded = library
         return None
 
@@ -312,92 +306,63 @@ class NativeModule:
 
     def _places(self) -> Iterator[Path]:
         """Places of a library for this machine and these sources, best first."""
-        # One without CUDA only where none with it can be built: else an old build would hide the GPU for ever.
-        prebuilt_for_cuda = self.cuda_sources and importlib.import_module("torch").version.cuda is not None
-        wanted = (True,) if self._with_cuda() else (True, False) if prebuilt_for_cuda else (False,)
-        for cuda, folder, march in itertools.product(wanted, (self.prebuilt_folder, self.cache_folder), MARCHES):
-            yield self._library(folder, march, cuda)
+        for folder, march in itertools.product((self.prebuilt_folder, self.cache_folder), MARCHES):
+            yield self._library(folder, march)
 
     def prebuilt_name(self, march: str) -> str:
-        """File name in a package of a library with a face: the wheel around it tells for which machine."""
+        """File name in a package: the wheel around it tells for which machine."""
         return f"{self.name}-{march}-{self.source_hash()}.so"
 
-    def _library(self, folder: Path, march: str, cuda: bool | None = None) -> Path:
-        if self.face and folder == self.prebuilt_folder:
-            return folder / self.prebuilt_name(march)
-        return folder / f"{self.name}-{self.key(march, cuda, any_gpu=folder == self.prebuilt_folder)}.so"
+    def _library(self, folder: Path, march: str) -> Path:
+        name = self.prebuilt_name(march) if folder == self.prebuilt_folder else f"{self.name}-{self.key(march)}.so"
+        return folder / name
 
     def _root(self) -> Path:
-        spec = importlib.util.find_spec(self.package)
-        if spec is None or not spec.submodule_search_locations:
-            raise NativeBuildError(f"native module '{self.name}': package '{self.package}' is not a folder on disk")
-        return Path(next(iter(spec.submodule_search_locations)))
+        return _folder_of(self.package)
 
-    def _files(self, with_cuda: bool) -> list[Path]:
+    def _files(self) -> list[Path]:
         """All files that the binary is made from, in a fixed order."""
         root = self._root()
-        cuda = self.cuda_sources if with_cuda else ()
         headers = [p for pattern in self.headers for p in (sorted(root.glob(pattern)) or [root / pattern])]
         shared = sorted(toolchain.SHARED_INCLUDE.rglob("*.h"))
-        return [*(root / s for s in (*self.sources, *self.kernels, *cuda)), *headers, *shared]
-
-    def _with_cuda(self) -> bool:
-        return self._without_cuda() is None
-
-    def _without_cuda(self) -> str | None:
-        """The reason why a build here holds no CUDA kernels, or None."""
-        if not self.cuda_sources:
-            return f"module '{self.name}' has no CUDA kernels"
-        return cuda_toolkit.toolkit_mismatch()
-
-    def _common_flags(self) -> tuple[str, ...]:
-        return toolchain.plain_flags() if self.face else toolchain.common_flags()
+        return [*(root / s for s in (*self.sources, *self.kernels, *self.cuda_sources)), *headers, *shared]
 
     def _jobs(self, march: str, objects: Path) -> list[Job]:
-        root, cuda = self._root(), self._with_cuda()
+        root, cuda = self._root(), bool(self.cuda_sources)
         variants = toolchain.arch_variants(march)
-        shared = [*self._common_flags()]
-        if cuda:
-            shared.append("-DSW_WITH_CUDA")
+        shared = [*toolchain.plain_flags()]
         if "arch_v2" in variants:
             shared.append("-DSW_PORTABLE_X86")
-        # The binding runs on every machine that the binary is for, so it gets the lowest of the variants.
+        # What stands behind the face runs on every machine that the binary is for: it gets the lowest of the variants.
         lowest = next(iter(variants.values()))
-        include = toolchain.SHARED_INCLUDE_FLAGS
-        torchs = () if self.face else toolchain.torch_include_flags(cuda=cuda)
-        binding = (*shared, *lowest, *include, *torchs, *self.cflags)
-        sources = [root / s for s in self.sources]
-        if self.face:
-            sources.append(objects / f"{self.name}.cpp")
-            sources[-1].write_text(
-                f'#include <splatwizard/c_face.h>\nSW_FACE({self.name}, "{self.source_hash()}")\n', "utf-8"
-            )
-        jobs = [Job(source, objects / f"{i}.o", binding) for i, source in enumerate(sources)]
+        include = (*toolchain.SHARED_INCLUDE_FLAGS, *(toolchain.cuda_include_flags() if cuda else ()))
+        told = objects / f"{self.name}.cpp"
+        told.write_text(f'#include <splatwizard/c_face.h>\nSW_FACE({self.name}, "{self.source_hash()}")\n', "utf-8")
+        sources = [*(root / s for s in self.sources), told]
+        flags = (*shared, *lowest, *include, *self.cflags)
+        jobs = [Job(source, objects / f"{i}.o", flags) for i, source in enumerate(sources)]
         # Lowest level first: of inline functions that several objects emit the linker keeps the first, and that
         # one must run on every machine.
-        for arch, flags in variants.items():
-            kernel = (*shared, *include, *self.cflags, *flags, f"-DSW_ARCH={arch}")
+        for arch, own in variants.items():
+            kernel = (*shared, *include, *self.cflags, *own, f"-DSW_ARCH={arch}")
             jobs += [Job(root / s, objects / f"{arch}-{i}.o", kernel) for i, s in enumerate(self.kernels)]
-        if cuda:
-            plain = [a.replace(".", "") for a in cuda_toolkit.architectures()]
-            gencode = [f"-gencode=arch=compute_{a},code=sm_{a}" for a in plain]
-            flags = ("-std=c++20", "-O3", "-Xcompiler", "-fPIC", "-DSW_WITH_CUDA", *gencode, *include)
-            jobs += [Job(root / s, objects / f"cuda-{i}.o", flags, cuda=True) for i, s in enumerate(self.cuda_sources)]
+        nvcc = (*toolchain.nvcc_flags(), *toolchain.SHARED_INCLUDE_FLAGS) if cuda else ()
+        jobs += [Job(root / s, objects / f"cuda-{i}.o", nvcc, cuda=True) for i, s in enumerate(self.cuda_sources)]
         return jobs
 
     def _kept(self, jobs: Sequence[Job], compiler: str) -> list[Path]:
         """Places of objects, by all that they depend on, so that one changed file is compiled alone."""
-        headers = [path for path in self._files(self._with_cuda()) if path.suffix == ".h"]
-        folder, torchs = self.cache_folder / "objects", "" if self.face else importlib.metadata.version("torch")
+        headers = [path for path in self._files() if path.suffix == ".h"]
+        folder = self.cache_folder / "objects"
         places = []
         for job in jobs:
-            facts: list[object] = [compiler, torchs, [f for f in job.flags if f != str(toolchain.SHARED_INCLUDE)]]
+            facts: list[object] = [compiler, [f for f in job.flags if f != str(toolchain.SHARED_INCLUDE)]]
             places.append(folder / f"{job.source.stem}-{self._digest(facts, [job.source, *headers])}.o")
         return places
 
     def _compile(self, library: Path, march: str, tools: Toolchain, say: Say, force: bool) -> None:
         say(f"compiling kernels '{self.name}' (once) ...")
-        started, cuda = time.monotonic(), self._with_cuda()
+        started = time.monotonic()
         build_log = library.with_suffix(".log")
         build_log.unlink(missing_ok=True)
         prefix = f".{library.stem}-"
@@ -408,12 +373,12 @@ class NativeModule:
             kept = dict(zip(jobs, self._kept(jobs, tools.version()), strict=True))
             missing = [job for job, place in kept.items() if force or not fetch(place, job.output)]
             built, shown = Path(scratch) / library.name, Path(scratch) / "shown"
-            shown.write_text(f"{{ global: {self.name}_*; local: *; }};\n", "utf-8")
+            shown.write_text(f"{{ global: {self.name}*; local: *; }};\n", "utf-8")
             try:
                 tools.compile(missing, build_log)
                 self._check_headers(missing)
-                plain = toolchain.plain_libraries(march, shown) if self.face else toolchain.torch_libraries(cuda=cuda)
-                tools.link([j.output for j in jobs], built, build_log, plain)
+                libraries = toolchain.plain_libraries(march, shown, cuda=bool(self.cuda_sources))
+                tools.link([j.output for j in jobs], built, build_log, libraries)
             except NativeBuildError as error:
                 raise NativeBuildError(f"\n{error}\nfull log: {build_log}") from error
             for job in missing:
@@ -423,7 +388,7 @@ class NativeModule:
                 "seconds": seconds,
                 "compiler": tools.version(),
                 "march": march,
-                "architectures": cuda_toolkit.architectures() if cuda else [],
+                "architectures": cuda_toolkit.architectures() if self.cuda_sources else [],
             }
             install(built, library, facts)
         say(f"compiled kernels '{self.name}' in {seconds:.0f} s")
@@ -431,7 +396,7 @@ class NativeModule:
     def _check_headers(self, jobs: list[Job]) -> None:
         """A header of the package that is not declared would let a stale build pass for a fresh one."""
         root = self._root().resolve()
-        known = {p.resolve() for p in self._files(self._with_cuda())}
+        known = {p.resolve() for p in self._files()}
         for job in jobs:
             for path in toolchain.read_dependencies(Path(f"{job.output}.d")):
                 resolved = path.resolve()
@@ -444,6 +409,13 @@ class NativeModule:
     def _failure(self, reason: object) -> NativeBuildError:
         without = f"\nwithout them: {self.without}" if self.without else ""
         return NativeBuildError(f"kernels '{self.name}' are not available: {reason}{without}")
+
+
+def _folder_of(package: str) -> Path:
+    spec = importlib.util.find_spec(package)
+    if spec is None or not spec.submodule_search_locations:
+        raise NativeBuildError(f"package '{package}' is not a folder on disk")
+    return Path(next(iter(spec.submodule_search_locations)))
 
 
 @functools.cache

@@ -178,7 +178,7 @@ def _check_module(module: NativeModule) -> Check:
     if facts["state"] == "damaged":
         detail = "the build in the cache is damaged"
         return Check("kernels", module.name, "broken", detail, f"{build} --force", facts=facts)
-    reason = module.available(cuda=bool(module.cuda_sources))
+    reason = module.available()
     when = "compiled when first used" if reason is None else one_line(reason)
     detail = f"reference: not built; {when}. Without: {module.without}"
     return Check("kernels", module.name, "missing", detail, build, facts=facts)
