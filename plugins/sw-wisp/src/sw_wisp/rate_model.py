@@ -15,13 +15,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from sw_wisp.context import ContextNetworks, Draw, Forecast
+from sw_wisp.context import ContextNetworks, Forecast
 from sw_wisp.fast.running_means import pyramid_of
 from sw_wisp.nested import UNIT, index_bits
 from sw_wisp.numbers import BLOCKS, HIGHEST_LEVEL, LOWEST_LEVEL, NUMBERS
 from sw_wisp.predicting import STEPS_OF
 from sw_wisp.pyramid import walked_features
 from sw_wisp.rate import bits, level_of, sigma_of
+from sw_wisp.rounding import AS_THEY_ARE, HARD, Rounding
 from sw_wisp.static import ENOUGH, MEAN_UNIT, StaticContext
 
 if TYPE_CHECKING:
@@ -70,9 +71,9 @@ class RateModel(Protocol):
         ...
 
     def fit(
-        self, context: tuple[Tensor, ...], values: Tensor, draw: Draw, updates: int, weights: Tensor | None
+        self, context: tuple[Tensor, ...], values: Tensor, rounding: Rounding, updates: int, weights: Tensor | None
     ) -> None:
-        """Learn to code values [N,22], drawn by `draw`, in few bits, without pictures.
+        """Learn to code values [N,22], drawn by `rounding`, in few bits, without pictures.
 
         weights     [N,22] bits that a squared unit of error of a number is worth: steps follow these; None: they stay
         """
@@ -90,8 +91,8 @@ class RateModel(Protocol):
         """Return rows of the model that are new, by name; what the file holds of the rate model stays."""
         ...
 
-    def predict(self, context: tuple[Tensor, ...], values: Tensor, draw: Draw) -> tuple[Forecast, Tensor]:
-        """Return distributions of values [N,22], and the values as `draw` draws them under these; differentiable."""
+    def predict(self, context: tuple[Tensor, ...], values: Tensor, rounding: Rounding) -> tuple[Forecast, Tensor]:
+        """Return distributions of values [N,22], and the values as they are drawn under these; differentiable."""
         ...
 
     def round_weights(self) -> None:
@@ -103,8 +104,13 @@ class RateModel(Protocol):
         ...
 
 
-def bits_of(values: Tensor, forecast: Forecast) -> Tensor:
-    """Return the bits [N,22] of the bins around drawn values [N,22]; differentiable in values and forecast."""
+def bits_of(values: Tensor, forecast: Forecast, last: int | None = None) -> Tensor:
+    """Return the bits [N,22] of the bins around drawn values [N,22]; differentiable in values and forecast.
+
+    last    only those of so many rows at the end
+    """
+    if last is not None:
+        values, forecast = values[-last:], Forecast(*(each[-last:] for each in forecast))
     return bits(values - forecast.mean, sigma_of(forecast.scale, forecast.steps), forecast.steps)
 
 
@@ -142,7 +148,7 @@ class StaticRate(nn.Module):
         return self.measure(splats, ())
 
     def fit(
-        self, context: tuple[Tensor, ...], values: Tensor, draw: Draw, updates: int, weights: Tensor | None
+        self, context: tuple[Tensor, ...], values: Tensor, rounding: Rounding, updates: int, weights: Tensor | None
     ) -> None:
         """Do nothing: `measure` finds what is best."""
 
@@ -173,12 +179,13 @@ class StaticRate(nn.Module):
     def reread(self, splats: Placed, context: tuple[Tensor, ...]) -> dict[str, Tensor]:
         return {}
 
-    def predict(self, context: tuple[Tensor, ...], values: Tensor, draw: Draw) -> tuple[Forecast, Tensor]:
+    def predict(self, context: tuple[Tensor, ...], values: Tensor, rounding: Rounding) -> tuple[Forecast, Tensor]:
         (levels,) = context
         row = self.row[levels - LOWEST_LEVEL]
         means = (self.means * (self.base_steps / UNIT)).float()[row]
         steps = self.base_steps.float().expand(len(levels), NUMBERS)
-        return Forecast(means, self.tables.float()[row], steps), draw(values, means, steps)
+        drawn = rounding.drawn(values, means, steps, rounding.noise(values))
+        return Forecast(means, self.tables.float()[row], steps), drawn
 
     def round_weights(self) -> None:
         """Do nothing: there are no weights."""
@@ -235,7 +242,7 @@ class PyramidRate(nn.Module):
 
     @torch.enable_grad()
     def fit(
-        self, context: tuple[Tensor, ...], values: Tensor, draw: Draw, updates: int, weights: Tensor | None
+        self, context: tuple[Tensor, ...], values: Tensor, rounding: Rounding, updates: int, weights: Tensor | None
     ) -> None:
         """Take Adam steps on the bits of some splats each, and what the errors of rounding are worth."""
         optimizer = torch.optim.Adam(self.networks.parameters(), lr=FIT_LR)
@@ -243,7 +250,7 @@ class PyramidRate(nn.Module):
             optimizer.param_groups[0]["lr"] = FIT_LR * LAST_FIT_LR ** (update / updates)
             rows = torch.randint(len(values), (min(FIT_BATCH, len(values)),), device=values.device)
             known = tuple(each[rows] for each in context)
-            forecast, drawn = self._predict(known, values[rows], draw, weights is not None)
+            forecast, drawn = self.networks(*known, values[rows], rounding, moves_steps=weights is not None)
             cost = bits_of(drawn, forecast).sum(1)
             if weights is not None:
                 cost = cost + (weights[rows] * forecast.steps.square()).sum(1) / 12
@@ -258,33 +265,24 @@ class PyramidRate(nn.Module):
     @torch.no_grad()
     def measure(self, splats: Placed, context: tuple[Tensor, ...]) -> dict[str, Tensor]:
         """Walk through the splats as a file would hold them now."""
-        return self._walked(splats, context, _rounded)
+        return self._walked(splats, context, Rounding(HARD))
 
     @torch.no_grad()
     def reread(self, splats: Placed, context: tuple[Tensor, ...]) -> dict[str, Tensor]:
         """Walk through splats whose numbers are those of the file."""
-        return self._walked(splats, context, None)
+        return self._walked(splats, context, AS_THEY_ARE)
 
-    def _walked(self, splats: Placed, context: tuple[Tensor, ...], draw: Draw | None) -> dict[str, Tensor]:
-        forecast, drawn = self.networks(*context, splats.values, draw)
+    def _walked(self, splats: Placed, context: tuple[Tensor, ...], rounding: Rounding) -> dict[str, Tensor]:
+        forecast, drawn = self.networks(*context, splats.values, rounding)
         indices = ((drawn - forecast.mean) / forecast.steps).round()
         return dict(zip(self.CONTEXT, self._features(splats, drawn / self.base_steps, indices), strict=True))
 
     def _features(self, splats: Placed, units: Tensor, indices: Tensor) -> tuple[Tensor, Tensor]:
         return walked_features(self.networks.prior, splats.levels, splats.cells, units, indices, make=pyramid_of)
 
-    def predict(self, context: tuple[Tensor, ...], values: Tensor, draw: Draw) -> tuple[Forecast, Tensor]:
-        return self._predict(context, values, draw, self.adapts)
-
-    def _predict(
-        self, context: tuple[Tensor, ...], values: Tensor, draw: Draw, adapts: bool
-    ) -> tuple[Forecast, Tensor]:
-        forecast: Forecast
-        if adapts:
-            forecast, drawn = self.networks(*context, values, draw)
-            return forecast, drawn
-        forecast, drawn = self.networks(*context, values, lambda v, mean, steps: draw(v, mean, steps.detach()))
-        return forecast._replace(steps=forecast.steps.detach()), drawn
+    def predict(self, context: tuple[Tensor, ...], values: Tensor, rounding: Rounding) -> tuple[Forecast, Tensor]:
+        found: tuple[Forecast, Tensor] = self.networks(*context, values, rounding, moves_steps=self.adapts)
+        return found
 
     def round_weights(self) -> None:
         """Compute with the weights of the file, of eight bits."""
@@ -292,7 +290,3 @@ class PyramidRate(nn.Module):
 
     def exact(self) -> PyramidContext:
         return self.networks.exact()
-
-
-def _rounded(values: Tensor, mean: Tensor, steps: Tensor) -> Tensor:
-    return mean + steps * ((values - mean) / steps).round()
