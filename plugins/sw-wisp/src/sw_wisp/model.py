@@ -12,15 +12,18 @@ from torch import Tensor, nn
 from splatwizard_core.api import SH, GaussianInputs, GaussianModel, SplatModel
 from sw_codecs.positions import morton
 from sw_wisp.appearance import AppearanceNetwork, sh_dc_of
-from sw_wisp.context import Forecast
 from sw_wisp.cube import Cube
+from sw_wisp.fast.kernels import fit_kernels
+from sw_wisp.fast.splats import drawable as fast_drawable
 from sw_wisp.file import Scene
-from sw_wisp.numbers import COLOUR, GROUPS, LATENTS, OPACITY, SHAPE, SIZE
+from sw_wisp.numbers import GROUPS, SIZE
 from sw_wisp.octree import Cells, position_bits
 from sw_wisp.pyramid import FEATURES
+from sw_wisp.rate import Forecast
 from sw_wisp.rate_model import Placed, PyramidRate, StaticRate, bits_of
 from sw_wisp.rounding import AS_THEY_ARE, FINAL, FLOAT, HARD, Rounding
-from sw_wisp.shape import bounded, covariance, scales_and_quats
+from sw_wisp.shape import bounded, scales_and_quats
+from sw_wisp.splats import drawable
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Camera, Rasterizer
@@ -148,10 +151,7 @@ class WispModel(SplatModel):
         return bits_of(drawn, forecast)
 
     def drawn_and_bits(self, sample: Tensor) -> tuple[Tensor, Tensor]:
-        """The 22 numbers [N,22] of all splats as they are drawn, and the bits [S,22] of some of them; differentiable.
-
-        sample      [S] rows whose bits are counted, under noise of their own
-        """
+        """Numbers [N,22] of all splats as drawn, and bits [S,22] of some under noise of their own; differentiable."""
         numbers = self.numbers()
         first = 0 if self.rounding is AS_THEY_ARE else len(numbers)
 
@@ -181,8 +181,7 @@ class WispModel(SplatModel):
 
     def measure(self) -> None:
         """Bring the rate model up to date with the splats; once the integers are fixed, only what it reads."""
-        again = self.rate.reread if self.phase == FINAL else self.rate.measure
-        self._take(again(self._placed(), self._context))
+        self._take(self.rate.measure(self._placed(), self._context, fixed=self.phase == FINAL))
 
     def _placed(self) -> Placed:
         return Placed(self.numbers().detach(), self.levels, self.cube.cells(self.means, self.levels))
@@ -210,20 +209,15 @@ class WispModel(SplatModel):
         means, edges = self.means, self.log_edges(self.levels)
         if self.jitters and self.training:
             means = means + (torch.rand_like(means) - 0.5) * edges.exp()[:, None]
-        colour = values[:, COLOUR.columns]
+        make = fast_drawable if fit_kernels(values, edges) else drawable
+        opacities, covariances, dc, rest = make(values, edges, self.bounds, self.network)
         return GaussianInputs(
             means=means,
-            opacities=torch.sigmoid(values[:, OPACITY.columns].squeeze(1)),
-            cov3d=covariance(
-                values[:, SHAPE.columns], values[:, SIZE.columns].squeeze(1) + edges, *self.bounds
-            ),
-            sh=SH(
-                dc=sh_dc_of(colour),
-                rest=self.network(values[:, LATENTS.columns], colour),
-                active_degree=self.network.degree,
-            ),
+            opacities=opacities,
+            cov3d=covariances,
+            sh=SH(dc=dc, rest=rest, active_degree=self.network.degree),
             extras=extras,
-        )  # fmt: skip
+        )
 
     @torch.no_grad()
     def tidied(self) -> dict[str, Tensor]:
