@@ -11,7 +11,7 @@ from sw_wisp.numbers import NUMBERS
 from sw_wisp.predicting import STEPS_OF
 from sw_wisp.pyramid import FEATURES
 from sw_wisp.rate_model import Placed, PyramidRate, bits_of
-from sw_wisp.rounding import HARD, NOISE, disturbed
+from sw_wisp.rounding import HARD, NOISE, Rounding
 
 APART = 1 / 8
 """Between the middles of two entries of the table of multipliers."""
@@ -34,7 +34,7 @@ def drawn_by(net, n, phase, seed=0):
     torch.manual_seed(seed)
     features = torch.zeros(n, FEATURES)
     values = torch.randn(n, NUMBERS) * 3 * net.base_steps
-    return values, *net(features, features, values, lambda *given: disturbed(*given, phase))
+    return values, *net(features, features, values, Rounding(phase))
 
 
 def slopes(net, loss):
@@ -81,22 +81,21 @@ def test_networks_fitted_to_numbers_code_them_in_fewer_bits_and_take_the_steps_t
     splats = Placed(scene.values.float(), scene.levels, scene.cells)
     rows = tuple(rate.begin(splats).values())
 
-    def draw(values, mean, steps):
-        return disturbed(values, mean, steps, NOISE)
+    rounding = Rounding(NOISE)
 
     def found():
         torch.manual_seed(1)
-        forecast, drawn = rate.predict(rows, splats.values, draw)
+        forecast, drawn = rate.predict(rows, splats.values, rounding)
         return forecast.steps / base, bits_of(drawn, forecast).sum(1).mean().item()
 
     torch.manual_seed(0)
     steps, before = found()
     assert torch.allclose(steps, torch.full_like(steps, 0.5), rtol=0.13)  # entries of the table lie that far apart
-    rate.fit(rows, splats.values, draw, 150, None)
+    rate.fit(rows, splats.values, rounding, 150, None)
     still, after = found()
     assert after < before - 3
     assert torch.equal(still, steps)
     # With Q far below the deviation, bits fall by 1 / ln 2 for each factor e of Q: least where w Q^2 / 6 is that.
     weights = (6 / math.log(2) / (0.25 * base) ** 2).expand(3_000, NUMBERS)
-    rate.fit(rows, splats.values, draw, 300, weights)
+    rate.fit(rows, splats.values, rounding, 300, weights)
     assert torch.allclose(found()[0].log().mean(0), torch.tensor(0.25).log(), atol=0.2)

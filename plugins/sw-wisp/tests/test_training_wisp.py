@@ -21,12 +21,13 @@ from sw_wisp.config import WispConfig
 from sw_wisp.conversion import kept_rows
 from sw_wisp.method import Wisp
 from sw_wisp.removal import unworthy
-from sw_wisp.rounding import FINAL, HARD, NOISE, SOFT, disturbed, soft_round
+from sw_wisp.rounding import FINAL, HARD, NOISE, SOFT, Rounding, soft_round
 
 PLAN = """\
 Stage | Task                             | Plan
 ------+----------------------------------+-------------------------
 Pre   | update lr                        | range(18001)
+Pre   | count bits                       | range(18001)
 Pre   | begin noise                      | 1501
 Pre   | steps follow the networks        | 4000
 Pre   | fix levels                       | [6000, 9000]
@@ -153,15 +154,19 @@ def test_rounding_of_each_phase():
     draws = torch.Generator().manual_seed(0)
     values = torch.randn(2_000, 3, generator=draws)
     mean, steps = torch.full_like(values, 0.1), torch.tensor([0.5, 1.0, 0.25]).expand(2_000, 3)
-    noisy = disturbed(values, mean, steps, NOISE) - values
+
+    def drawn(rounding):
+        return rounding.drawn(values, mean, steps, rounding.noise(values))
+
+    noisy = drawn(Rounding(NOISE)) - values
     assert (noisy.abs() <= steps / 2).all()
     assert torch.allclose(noisy.std(0), steps[0] / 12**0.5, rtol=0.05)
-    hard = disturbed(values, mean, steps, HARD)
+    hard = drawn(Rounding(HARD))
     k = (hard - mean) / steps
     assert torch.allclose(k, k.round(), atol=1e-5)
     assert ((hard - values).abs() <= steps / 2 + 1e-6).all()
-    assert torch.allclose(disturbed(values, mean, steps, SOFT, 8.0), hard, atol=0.51 * steps.max())
-    assert torch.equal(disturbed(values, mean, steps, FINAL), values)
+    assert torch.allclose(drawn(Rounding(SOFT, 8.0)), hard, atol=0.51 * steps.max())
+    assert torch.equal(drawn(Rounding(FINAL)), values)
 
 
 def test_short_training_ends_with_integers_in_cells(whole):

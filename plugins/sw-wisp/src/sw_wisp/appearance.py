@@ -53,7 +53,7 @@ class AppearanceNetwork(nn.Module):
         self.degree, self.rounds = degree, False
         outputs = 3 * ((degree + 1) ** 2 - 1)
         basis = torch.randn(outputs, latents, generator=generator)
-        self.basis = nn.Parameter(torch.linalg.qr(basis).Q if outputs >= latents else basis)
+        self.basis = nn.Parameter(torch.linalg.qr(basis).Q.contiguous() if outputs >= latents else basis)
         self.hidden = nn.Linear(latents + COLOURS, hidden)
         self.out = nn.Linear(hidden, outputs)
         with torch.no_grad():

@@ -1,23 +1,10 @@
 """Networks that predict the 22 numbers of a splat from the running means around it, as they are trained.
 
-How a training uses them, with `net = ContextNetworks(base_steps)` and N splats:
-
-    features = walked_features(net.prior, levels, cells, values / base_steps, indices)   # every 100 or 200 steps
-    forecast, drawn = net(*features, numbers, draw)         # at each step, for all splats that are drawn
-    bits(drawn - forecast.mean, sigma_of(forecast.scale, forecast.steps), forecast.steps)   # [N,22], differentiable
-
-`numbers` are the 22 values [N,22], `draw(values, mean, steps)` is what stands in for rounding (noise, soft or hard
-rounding) of the columns of one block: the next block's network sees what it returned. `forecast.mean`, `.scale` and
-`.steps` have gradients to the networks; features are constants, rows of them follow the splats. Once, before the first
-step with a rate: `net.start(features[0], features[1], values / base_steps)`. `net.rounds = True`: weights as in the
-file. `net.exact()`: the context of the file, for `Scene(context=...)`; that file's integers are the closed loop, so a
-training that fixes them takes those of `file.encode`, not its own rounding.
+Features (`pyramid.walked_features`) are constants, rows of the model that follow the splats. A file's integers are the
+closed loop: a training that fixes them takes those of `file.encode`, not its own rounding.
 """
 
 from __future__ import annotations
-
-from collections.abc import Callable
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -29,30 +16,12 @@ from sw_wisp.eight_bits import EXACT_EXPONENT, EightBitLayer, rounded_weights
 from sw_wisp.nested import UNIT
 from sw_wisp.numbers import BASE_STEPS, BLOCKS, NUMBERS, PARTS
 from sw_wisp.predicting import STEPS_OF, PyramidContext, network_shapes
-from sw_wisp.rate import level_of, sigma_of
+from sw_wisp.rate import Forecast, level_of, sigma_of
+from sw_wisp.rounding import AS_THEY_ARE, Rounding
 from sw_wisp.static import MEAN_UNIT
 from sw_wisp.ties import LARGEST_SIZE, ROUNDING, tie_shapes
 
 LARGEST_PRIOR = 32767 * MEAN_UNIT
-Draw = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""(values, mean, steps) [N,c] -> values as they are drawn."""
-
-
-class Forecast(NamedTuple):
-    """Distributions of the 22 numbers of N splats, each [N,22].
-
-    mean    in the units of the numbers
-    scale   level 0..63 of the table: linear in the logarithm of the deviation in steps
-    steps   quantiser steps, in the units of the numbers
-    """
-
-    mean: Tensor
-    scale: Tensor
-    steps: Tensor
-
-    def part(self, columns: slice) -> Forecast:
-        """Return the forecast of some numbers."""
-        return Forecast(self.mean[:, columns], self.scale[:, columns], self.steps[:, columns])
 
 
 def _residuals(drawn: Tensor, known: Forecast, unit: Tensor) -> tuple[Tensor, Tensor]:
@@ -93,13 +62,16 @@ class ContextNetworks(nn.Module):
         self.register_buffer("multipliers", table, persistent=False)
 
     def forward(
-        self, features: Tensor, view_features: Tensor, values: Tensor, draw: Draw | None = None
-    ) -> tuple[Forecast, Tensor]:
+        self, features: Tensor, view_features: Tensor, values: Tensor, rounding: Rounding = AS_THEY_ARE, *,
+        moves_steps: bool = True,
+    ) -> tuple[Forecast, Tensor]:  # fmt: skip
         """Forecast for splats of features [N,69] (those of latents: `view_features`) and values [N,22], and the drawn.
 
-        draw    None: values as they are
+        rounding        what stands in for it: the next network sees what is drawn of one block
+        moves_steps     whether steps have a gradient
         """
         parts: list[Forecast] = []
+        noise = rounding.noise(values)
         ties = iter(self.ties)
         drawn = values[:, :0]
         for number, block in enumerate(BLOCKS):
@@ -109,14 +81,15 @@ class ContextNetworks(nn.Module):
             out = self._evaluate(number, torch.cat([own, known], dim=1))
             mean = (own[:, block] + out[:, :width]) * unit
             steps = (self._multipliers(out[:, 2 * width :])[:, STEPS_OF[number]] * unit).expand(len(values), -1)
+            steps = steps if moves_steps else steps.detach()
             found = Forecast(mean, out[:, width : 2 * width], steps)
             told: list[tuple[Tensor, Tensor]] = []
             for columns in PARTS[number]:
-                own = found.part(slice(columns.start - block.start, columns.stop - block.start))
+                own = Forecast(*(t[:, columns.start - block.start : columns.stop - block.start] for t in found))
                 if told:
                     own = self._tied(next(ties), own, told, self.base_steps[columns])
-                part = values[:, columns]
-                taken = part if draw is None else draw(part, own.mean, own.steps)
+                own_noise = None if noise is None else noise[:, columns]
+                taken = rounding.drawn(values[:, columns], own.mean, own.steps, own_noise)
                 told.append(_residuals(taken.detach(), own, self.base_steps[columns]))
                 drawn = torch.cat([drawn, taken], dim=1)
                 parts.append(own)

@@ -8,6 +8,7 @@ from torch import Tensor
 from sw_wisp.context import ContextNetworks
 from sw_wisp.pyramid import walked_features
 from sw_wisp.rate import bits, sigma_of
+from sw_wisp.rounding import HARD, Rounding
 
 ROUNDS = 4
 """How often indices and features are brought up to date with what the networks say."""
@@ -47,7 +48,7 @@ def fitted_context(
             net.rounds = step >= updates // 2
         optimizer.param_groups[0]["lr"] = lr * LAST_ROUND_LR ** (step / updates)
         rows = torch.randint(len(values), (min(batch, len(values)),), generator=generator).to(values.device)
-        forecast, drawn = net(features[0][rows], features[1][rows], values[rows], _rounded)
+        forecast, drawn = net(features[0][rows], features[1][rows], values[rows], Rounding(HARD))
         cost = bits(drawn - forecast.mean, sigma_of(forecast.scale, forecast.steps), forecast.steps).sum(1).mean()
         optimizer.zero_grad()
         cost.backward()
@@ -55,16 +56,10 @@ def fitted_context(
     return net
 
 
-def _rounded(values: Tensor, mean: Tensor, steps: Tensor) -> Tensor:
-    """Values on the lattice around their means; straight-through."""
-    offset = (values - mean) / steps
-    return mean + steps * (offset + (offset.round() - offset).detach())
-
-
 @torch.no_grad()
 def _renewed(
     net: ContextNetworks, features: tuple[Tensor, Tensor], levels: Tensor, cells: Tensor, values: Tensor
 ) -> tuple[Tensor, Tensor]:
-    forecast, drawn = net(*features, values, _rounded)
+    forecast, drawn = net(*features, values, Rounding(HARD))
     indices = ((drawn - forecast.mean) / forecast.steps).round()
     return walked_features(net.prior, levels, cells, drawn / net.base_steps, indices)

@@ -12,15 +12,18 @@ from torch import Tensor, nn
 from splatwizard_core.api import SH, GaussianInputs, GaussianModel, SplatModel
 from sw_codecs.positions import morton
 from sw_wisp.appearance import AppearanceNetwork, sh_dc_of
-from sw_wisp.context import Forecast
 from sw_wisp.cube import Cube
+from sw_wisp.fast.kernels import fit_kernels
+from sw_wisp.fast.splats import drawable as fast_drawable
 from sw_wisp.file import Scene
-from sw_wisp.numbers import COLOUR, GROUPS, LATENTS, OPACITY, SHAPE, SIZE
+from sw_wisp.numbers import GROUPS, SIZE
 from sw_wisp.octree import Cells, position_bits
 from sw_wisp.pyramid import FEATURES
+from sw_wisp.rate import Forecast
 from sw_wisp.rate_model import Placed, PyramidRate, StaticRate, bits_of
-from sw_wisp.rounding import FINAL, FLOAT, HARD, disturbed
-from sw_wisp.shape import bounded, covariance, scales_and_quats
+from sw_wisp.rounding import AS_THEY_ARE, FINAL, FLOAT, HARD, Rounding
+from sw_wisp.shape import bounded, scales_and_quats
+from sw_wisp.splats import drawable
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Camera, Rasterizer
@@ -70,6 +73,7 @@ class WispModel(SplatModel):
     sharpness   of soft rounding, up to `sharpest`
     jitters     whether positions are drawn anywhere in a cell of the splat's level around them
     adapts      whether quantiser steps may follow the rate model
+    counted     share of all splats whose bits are counted at each step
     """
 
     ROWS = ("means", "opacity", "shape", "size", "colour", "latents", "levels")
@@ -97,7 +101,7 @@ class WispModel(SplatModel):
         self.network, self.rate = network, rate
         self.cube = cube
         self.phase, self.sharpness, self.sharpest, self.jitters, self.adapts = FLOAT, 1.0, sharpest, False, False
-        self.split_seed = 0
+        self.split_seed, self.counted = 0, 0.0
 
     def log_edges(self, levels: Tensor) -> Tensor:
         """Logarithms [N] of the edges of cells at levels [N]."""
@@ -108,16 +112,10 @@ class WispModel(SplatModel):
         """Bounds of the log scales."""
         return bounds_in(self.cube)
 
-    def numbers(self, rows: Tensor | None = None) -> Tensor:
-        """The 22 numbers [N,22] of all splats or of some rows, size relative to the cell; differentiable."""
-
-        def of(name: str) -> Tensor:
-            values: Tensor = getattr(self, name)
-            return values if rows is None else values.index_select(0, rows)
-
-        levels = self.levels if rows is None else self.levels.index_select(0, rows)
-        size = of("size") - self.log_edges(levels)
-        return torch.cat([of("opacity")[:, None], of("shape"), size[:, None], of("colour"), of("latents")], dim=1)
+    def numbers(self) -> Tensor:
+        """The 22 numbers [N,22] of all splats, size relative to the cell; differentiable."""
+        size = self.size - self.log_edges(self.levels)
+        return torch.cat([self.opacity[:, None], self.shape, size[:, None], self.colour, self.latents], dim=1)
 
     @torch.no_grad()
     def set_numbers(self, values: Tensor) -> None:
@@ -129,27 +127,41 @@ class WispModel(SplatModel):
         self.colour.copy_(colour)
         self.latents.copy_(latents)
 
-    def predicted(self, rows: Tensor | None = None) -> tuple[Forecast, Tensor]:
-        """Distributions of the numbers of all splats, or of some rows, and these [N,22] as this phase rounds them."""
-        context = (getattr(self, name) for name in self.rate.CONTEXT)
-        context = context if rows is None else (each.index_select(0, rows) for each in context)
-        return self.rate.predict(tuple(context), self.numbers(rows), self._rounded)
+    def predicted(self) -> tuple[Forecast, Tensor]:
+        """Distributions of the numbers of all splats, and these [N,22] as this phase rounds them; differentiable."""
+        return self.rate.predict(self._context, self.numbers(), self.rounding)
 
     @property
-    def _rounds(self) -> bool:
-        return self.phase == HARD or (self.training and self.phase not in (FLOAT, FINAL))
+    def _context(self) -> tuple[Tensor, ...]:
+        return tuple(getattr(self, name) for name in self.rate.CONTEXT)
 
-    def _rounded(self, values: Tensor, mean: Tensor, steps: Tensor) -> Tensor:
-        return disturbed(values, mean, steps, self.phase, self.sharpness, self.sharpest) if self._rounds else values
+    @property
+    def rounding(self) -> Rounding:
+        """What stands in for rounding."""
+        rounds = self.phase == HARD or (self.training and self.phase not in (FLOAT, FINAL))
+        return Rounding(self.phase, self.sharpness, self.sharpest) if rounds else AS_THEY_ARE
 
     def drawn(self) -> Tensor:
         """The 22 numbers [N,22] of all splats as they are drawn; differentiable."""
-        return self.predicted()[1] if self._rounds else self.numbers()
+        return self.numbers() if self.rounding is AS_THEY_ARE else self.predicted()[1]
 
-    def bits(self, rows: Tensor | None = None) -> Tensor:
-        """Bits [N,22] of the numbers of all splats, or of some rows, as this phase rounds them; differentiable."""
-        forecast, drawn = self.predicted(rows)
+    def bits(self) -> Tensor:
+        """Bits [N,22] of the numbers of all splats as this phase rounds them; differentiable."""
+        forecast, drawn = self.predicted()
         return bits_of(drawn, forecast)
+
+    def drawn_and_bits(self, sample: Tensor) -> tuple[Tensor, Tensor]:
+        """Numbers [N,22] of all splats as drawn, and bits [S,22] of some under noise of their own; differentiable."""
+        numbers = self.numbers()
+        first = 0 if self.rounding is AS_THEY_ARE else len(numbers)
+
+        def behind(rows: Tensor) -> Tensor:
+            return torch.cat([rows[:first], rows.index_select(0, sample)])
+
+        # The sample stands behind all splats, so that networks run once.
+        context = tuple(behind(each) for each in self._context)
+        forecast, drawn = self.rate.predict(context, behind(numbers), self.rounding)
+        return drawn[:first] if first else numbers, bits_of(drawn, forecast, len(sample))
 
     def begin_rate(self) -> None:
         """Start the rate model anew from the splats."""
@@ -160,8 +172,7 @@ class WispModel(SplatModel):
 
         weights     [N,22] bits that a squared unit of error of each number is worth, for the steps; None: they stay
         """
-        context = tuple(getattr(self, name) for name in self.rate.CONTEXT)
-        self.rate.fit(context, self.numbers().detach(), self._rounded, updates, weights)
+        self.rate.fit(self._context, self.numbers().detach(), self.rounding, updates, weights)
 
     def adapt(self) -> None:
         """Let quantiser steps follow the rate model from here on."""
@@ -170,8 +181,7 @@ class WispModel(SplatModel):
 
     def measure(self) -> None:
         """Bring the rate model up to date with the splats; once the integers are fixed, only what it reads."""
-        again = self.rate.reread if self.phase == FINAL else self.rate.measure
-        self._take(again(self._placed(), tuple(getattr(self, name) for name in self.rate.CONTEXT)))
+        self._take(self.rate.measure(self._placed(), self._context, fixed=self.phase == FINAL))
 
     def _placed(self) -> Placed:
         return Placed(self.numbers().detach(), self.levels, self.cube.cells(self.means, self.levels))
@@ -188,24 +198,26 @@ class WispModel(SplatModel):
         return torch.from_numpy(position_bits(Cells(levels.cpu().numpy(), codes))).to(self.device)
 
     def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
-        """All splats, whatever the camera."""
-        values = self.drawn()
+        """All splats, whatever the camera; in training `extras["bits"]` [S,22] are those of the splats that count."""
+        extras = {}
+        if self.training and self.counted:
+            n = self.num_rows
+            sample = torch.randint(n, (max(1, math.ceil(self.counted * n)),), device=self.device)
+            values, extras["bits"] = self.drawn_and_bits(sample)
+        else:
+            values = self.drawn()
         means, edges = self.means, self.log_edges(self.levels)
         if self.jitters and self.training:
             means = means + (torch.rand_like(means) - 0.5) * edges.exp()[:, None]
-        colour = values[:, COLOUR.columns]
+        make = fast_drawable if fit_kernels(values, edges) else drawable
+        opacities, covariances, dc, rest = make(values, edges, self.bounds, self.network)
         return GaussianInputs(
             means=means,
-            opacities=torch.sigmoid(values[:, OPACITY.columns].squeeze(1)),
-            cov3d=covariance(
-                values[:, SHAPE.columns], values[:, SIZE.columns].squeeze(1) + edges, *self.bounds
-            ),
-            sh=SH(
-                dc=sh_dc_of(colour),
-                rest=self.network(values[:, LATENTS.columns], colour),
-                active_degree=self.network.degree,
-            ),
-        )  # fmt: skip
+            opacities=opacities,
+            cov3d=covariances,
+            sh=SH(dc=dc, rest=rest, active_degree=self.network.degree),
+            extras=extras,
+        )
 
     @torch.no_grad()
     def tidied(self) -> dict[str, Tensor]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,6 +14,19 @@ SMALLEST, RANGE, HIGHEST_LEVEL = 0.05, 1280.0, 63
 """Scale of table level 0 in steps, that of level 63 over it, and the last level."""
 LEAST_PROBABILITY = 2.0**-16
 """Share of the rarest entry of a table."""
+
+
+class Forecast(NamedTuple):
+    """Distributions of the 22 numbers of N splats, each [N,22].
+
+    mean    in the units of the numbers
+    scale   level 0..63 of the table: linear in the logarithm of the deviation in steps
+    steps   quantiser steps, in the units of the numbers
+    """
+
+    mean: Tensor
+    scale: Tensor
+    steps: Tensor
 
 
 class _InwardClamp(torch.autograd.Function):

@@ -9,23 +9,27 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Protocol
+from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from sw_wisp.context import ContextNetworks, Draw, Forecast
+from sw_wisp.context import ContextNetworks
+from sw_wisp.fast.kernels import fit_kernels
+from sw_wisp.fast.predicted import bits_of as fast_bits_of
+from sw_wisp.fast.predicted import predicted
 from sw_wisp.fast.running_means import pyramid_of
 from sw_wisp.nested import UNIT, index_bits
 from sw_wisp.numbers import BLOCKS, HIGHEST_LEVEL, LOWEST_LEVEL, NUMBERS
 from sw_wisp.predicting import STEPS_OF
 from sw_wisp.pyramid import walked_features
-from sw_wisp.rate import bits, level_of, sigma_of
+from sw_wisp.rate import Forecast, bits, level_of, sigma_of
+from sw_wisp.rounding import AS_THEY_ARE, HARD, Rounding
 from sw_wisp.static import ENOUGH, MEAN_UNIT, StaticContext
 
 if TYPE_CHECKING:
-    from sw_wisp.packets import Context
     from sw_wisp.predicting import PyramidContext
 
 TABLES = 64
@@ -53,58 +57,12 @@ class Placed:
     cells: Tensor
 
 
-class RateModel(Protocol):
-    """Protocol of rate models.
-
-    CONTEXT     rows of the model that it predicts from
-    base_steps  [22] quantiser steps where it says no others
-    """
-
-    CONTEXT: ClassVar[tuple[str, ...]]
-
-    @property
-    def base_steps(self) -> Tensor: ...
-
-    def begin(self, splats: Placed) -> dict[str, Tensor]:
-        """Start from these splats; return rows of the model, by name, for it to predict from."""
-        ...
-
-    def fit(
-        self, context: tuple[Tensor, ...], values: Tensor, draw: Draw, updates: int, weights: Tensor | None
-    ) -> None:
-        """Learn to code values [N,22], drawn by `draw`, in few bits, without pictures.
-
-        weights     [N,22] bits that a squared unit of error of a number is worth: steps follow these; None: they stay
-        """
-        ...
-
-    def adapt(self) -> None:
-        """Let quantiser steps follow the networks from here on, if they are to."""
-        ...
-
-    def measure(self, splats: Placed, context: tuple[Tensor, ...]) -> dict[str, Tensor]:
-        """Come up to date with these splats; return rows of the model that are new, by name."""
-        ...
-
-    def reread(self, splats: Placed, context: tuple[Tensor, ...]) -> dict[str, Tensor]:
-        """Return rows of the model that are new, by name; what the file holds of the rate model stays."""
-        ...
-
-    def predict(self, context: tuple[Tensor, ...], values: Tensor, draw: Draw) -> tuple[Forecast, Tensor]:
-        """Return distributions of values [N,22], and the values as `draw` draws them under these; differentiable."""
-        ...
-
-    def round_weights(self) -> None:
-        """Compute with the weights of the file from here on."""
-        ...
-
-    def exact(self) -> Context:
-        """Return the same distributions in the integers of the file."""
-        ...
-
-
-def bits_of(values: Tensor, forecast: Forecast) -> Tensor:
-    """Return the bits [N,22] of the bins around drawn values [N,22]; differentiable in values and forecast."""
+def bits_of(values: Tensor, forecast: Forecast, last: int | None = None) -> Tensor:
+    """Return the bits [N,22] of the bins around drawn values [N,22], or of the last rows alone; differentiable."""
+    if fit_kernels(values, *forecast):
+        return fast_bits_of(values, forecast, last)
+    if last is not None:
+        values, forecast = values[-last:], Forecast(*(each[-last:] for each in forecast))
     return bits(values - forecast.mean, sigma_of(forecast.scale, forecast.steps), forecast.steps)
 
 
@@ -116,7 +74,7 @@ def _costs(device: torch.device) -> Tensor:
 
 
 class StaticRate(nn.Module):
-    """Means and tables by level; no parameters, `measure` sets them.
+    """Means and tables by level; no parameters, `measure` sets them. What its methods are for: `PyramidRate`.
 
     base_steps      [22] float64 quantiser steps
     row             [16] int64: which row of the next two serves levels 3..18
@@ -142,7 +100,7 @@ class StaticRate(nn.Module):
         return self.measure(splats, ())
 
     def fit(
-        self, context: tuple[Tensor, ...], values: Tensor, draw: Draw, updates: int, weights: Tensor | None
+        self, context: tuple[Tensor, ...], values: Tensor, rounding: Rounding, updates: int, weights: Tensor | None
     ) -> None:
         """Do nothing: `measure` finds what is best."""
 
@@ -150,8 +108,10 @@ class StaticRate(nn.Module):
         """Do nothing: steps are the base steps."""
 
     @torch.no_grad()
-    def measure(self, splats: Placed, context: tuple[Tensor, ...]) -> dict[str, Tensor]:
+    def measure(self, splats: Placed, context: tuple[Tensor, ...], *, fixed: bool = False) -> dict[str, Tensor]:
         """Take the means, and for each the table of fewest bits."""
+        if fixed:
+            return {}
         values, levels = splats.values, splats.levels
         place = levels - LOWEST_LEVEL
         counts = torch.bincount(place, minlength=LEVELS)
@@ -170,15 +130,13 @@ class StaticRate(nn.Module):
         self.tables.copy_(spent.argmin(dim=2))
         return {}
 
-    def reread(self, splats: Placed, context: tuple[Tensor, ...]) -> dict[str, Tensor]:
-        return {}
-
-    def predict(self, context: tuple[Tensor, ...], values: Tensor, draw: Draw) -> tuple[Forecast, Tensor]:
+    def predict(self, context: tuple[Tensor, ...], values: Tensor, rounding: Rounding) -> tuple[Forecast, Tensor]:
         (levels,) = context
         row = self.row[levels - LOWEST_LEVEL]
         means = (self.means * (self.base_steps / UNIT)).float()[row]
         steps = self.base_steps.float().expand(len(levels), NUMBERS)
-        return Forecast(means, self.tables.float()[row], steps), draw(values, means, steps)
+        drawn = rounding.drawn(values, means, steps, rounding.noise(values))
+        return Forecast(means, self.tables.float()[row], steps), drawn
 
     def round_weights(self) -> None:
         """Do nothing: there are no weights."""
@@ -194,6 +152,7 @@ class PyramidRate(nn.Module):
 
     steps       [22] quantiser steps to begin with; the networks count in those of `sw_wisp.numbers`
     adaptive    whether steps follow the networks, from `adapt` on
+    CONTEXT     rows of the model that it predicts from
     """
 
     CONTEXT = ("features", "view_features")
@@ -216,7 +175,7 @@ class PyramidRate(nn.Module):
 
     @torch.no_grad()
     def begin(self, splats: Placed) -> dict[str, Tensor]:
-        """Predict the running means alone."""
+        """Start from these splats, whose running means it predicts; return rows of the model to predict from."""
         units = splats.values / self.base_steps
         self.networks.measure_prior(units)
         features = self._features(splats, units, (units - self.networks.prior / UNIT).round())
@@ -235,15 +194,18 @@ class PyramidRate(nn.Module):
 
     @torch.enable_grad()
     def fit(
-        self, context: tuple[Tensor, ...], values: Tensor, draw: Draw, updates: int, weights: Tensor | None
+        self, context: tuple[Tensor, ...], values: Tensor, rounding: Rounding, updates: int, weights: Tensor | None
     ) -> None:
-        """Take Adam steps on the bits of some splats each, and what the errors of rounding are worth."""
-        optimizer = torch.optim.Adam(self.networks.parameters(), lr=FIT_LR)
+        """Learn to code values [N,22], drawn by `rounding`, in few bits without pictures: Adam on some splats each.
+
+        weights     [N,22] bits that a squared unit of error of a number is worth: steps follow these; None: they stay
+        """
+        optimizer = torch.optim.Adam(self.networks.parameters(), lr=FIT_LR, fused=True)
         for update in range(updates):
             optimizer.param_groups[0]["lr"] = FIT_LR * LAST_FIT_LR ** (update / updates)
             rows = torch.randint(len(values), (min(FIT_BATCH, len(values)),), device=values.device)
             known = tuple(each[rows] for each in context)
-            forecast, drawn = self._predict(known, values[rows], draw, weights is not None)
+            forecast, drawn = self._predict(known, values[rows], rounding, weights is not None)
             cost = bits_of(drawn, forecast).sum(1)
             if weights is not None:
                 cost = cost + (weights[rows] * forecast.steps.square()).sum(1) / 12
@@ -252,47 +214,37 @@ class PyramidRate(nn.Module):
             optimizer.step()
 
     def adapt(self) -> None:
-        """Let gradients move the steps."""
+        """Let gradients move the steps from here on, if they are to."""
         self.adapts = self.adaptive
 
     @torch.no_grad()
-    def measure(self, splats: Placed, context: tuple[Tensor, ...]) -> dict[str, Tensor]:
-        """Walk through the splats as a file would hold them now."""
-        return self._walked(splats, context, _rounded)
+    def measure(self, splats: Placed, context: tuple[Tensor, ...], *, fixed: bool = False) -> dict[str, Tensor]:
+        """Walk through the splats as a file would hold them now; return rows of the model that are new, by name.
 
-    @torch.no_grad()
-    def reread(self, splats: Placed, context: tuple[Tensor, ...]) -> dict[str, Tensor]:
-        """Walk through splats whose numbers are those of the file."""
-        return self._walked(splats, context, None)
-
-    def _walked(self, splats: Placed, context: tuple[Tensor, ...], draw: Draw | None) -> dict[str, Tensor]:
-        forecast, drawn = self.networks(*context, splats.values, draw)
+        fixed       their numbers are those of the file, and what it holds of the rate model stays
+        """
+        forecast, drawn = self._predict(context, splats.values, AS_THEY_ARE if fixed else Rounding(HARD), True)
         indices = ((drawn - forecast.mean) / forecast.steps).round()
         return dict(zip(self.CONTEXT, self._features(splats, drawn / self.base_steps, indices), strict=True))
 
     def _features(self, splats: Placed, units: Tensor, indices: Tensor) -> tuple[Tensor, Tensor]:
         return walked_features(self.networks.prior, splats.levels, splats.cells, units, indices, make=pyramid_of)
 
-    def predict(self, context: tuple[Tensor, ...], values: Tensor, draw: Draw) -> tuple[Forecast, Tensor]:
-        return self._predict(context, values, draw, self.adapts)
+    def predict(self, context: tuple[Tensor, ...], values: Tensor, rounding: Rounding) -> tuple[Forecast, Tensor]:
+        """Return distributions of values [N,22], and the values as they are drawn under these; differentiable."""
+        return self._predict(context, values, rounding, self.adapts)
 
     def _predict(
-        self, context: tuple[Tensor, ...], values: Tensor, draw: Draw, adapts: bool
+        self, context: tuple[Tensor, ...], values: Tensor, rounding: Rounding, moves_steps: bool
     ) -> tuple[Forecast, Tensor]:
-        forecast: Forecast
-        if adapts:
-            forecast, drawn = self.networks(*context, values, draw)
-            return forecast, drawn
-        forecast, drawn = self.networks(*context, values, lambda v, mean, steps: draw(v, mean, steps.detach()))
-        return forecast._replace(steps=forecast.steps.detach()), drawn
+        predict = partial(predicted, self.networks) if fit_kernels(values, *context) else self.networks
+        found: tuple[Forecast, Tensor] = predict(*context, values, rounding, moves_steps=moves_steps)
+        return found
 
     def round_weights(self) -> None:
-        """Compute with the weights of the file, of eight bits."""
+        """Compute with the weights of the file, of eight bits, from here on."""
         self.networks.rounds = True
 
     def exact(self) -> PyramidContext:
+        """Return the same distributions in the integers of the file."""
         return self.networks.exact()
-
-
-def _rounded(values: Tensor, mean: Tensor, steps: Tensor) -> Tensor:
-    return mean + steps * ((values - mean) / steps).round()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -20,23 +21,44 @@ def soft_round(y: Tensor, sharpness: float) -> Tensor:
     return floor + 0.5 + torch.tanh(sharpness * (y - floor - 0.5)) / (2 * math.tanh(sharpness / 2))
 
 
-def disturbed(
-    values: Tensor, mean: Tensor, steps: Tensor, phase: str, sharpness: float = 1.0, most: float = 8.0
-) -> Tensor:
-    """Return what is drawn, and whose bits are counted, for values [N,C]; differentiable, as far as rounding is.
+@dataclass(frozen=True)
+class Rounding:
+    """What is drawn, and whose bits are counted, in place of values.
 
-    mean, steps     [N,C] where the lattice of each number has its zero, and how wide its cells are
     phase           one of this module's
     sharpness       of soft rounding, 1..most; noise fades as it rises
-
-    Random numbers come from torch's own generator, which a checkpoint holds.
     """
-    if phase in (FLOAT, FINAL):
-        return values
-    if phase == NOISE:
-        return values + (torch.rand_like(values) - 0.5) * steps
-    offsets = (values - mean) / steps
-    if phase == SOFT:
-        noise = (torch.rand_like(values) - 0.5) * max(0.0, 1 - (sharpness - 1) / (most - 1))
-        return mean + steps * soft_round(soft_round(offsets, sharpness) + noise, sharpness)
-    return mean + steps * (offsets + (offsets.round() - offsets).detach())
+
+    phase: str
+    sharpness: float = 1.0
+    most: float = 8.0
+
+    def noise(self, values: Tensor) -> Tensor | None:
+        """Draw what `drawn` needs for values of this shape: numbers of U(-1/2, 1/2), fewer and fewer; None: nothing.
+
+        From torch's own generator, which a checkpoint holds.
+        """
+        if self.phase not in (NOISE, SOFT):
+            return None
+        width = 1.0 if self.phase == NOISE else max(0.0, 1 - (self.sharpness - 1) / (self.most - 1))
+        return torch.empty_like(values, requires_grad=False).uniform_(-width / 2, width / 2)
+
+    def drawn(self, values: Tensor, mean: Tensor, steps: Tensor, noise: Tensor | None) -> Tensor:
+        """Return values [N,C] as they are drawn; differentiable, as far as rounding is.
+
+        mean, steps     [N,C] where the lattice of each number has its zero, and how wide its cells are
+        noise           [N,C] from `noise`
+        """
+        if self.phase in (FLOAT, FINAL):
+            return values
+        if self.phase == NOISE:
+            assert noise is not None
+            return values + noise * steps
+        offsets = (values - mean) / steps
+        if self.phase == SOFT:
+            assert noise is not None
+            return mean + steps * soft_round(soft_round(offsets, self.sharpness) + noise, self.sharpness)
+        return mean + steps * (offsets + (offsets.round() - offsets).detach())
+
+
+AS_THEY_ARE = Rounding(FLOAT)

@@ -140,6 +140,7 @@ class WispStage(Stage):
     def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
         phases, rebuild = self.config.phases, self.config.context.rebuild
         scheduler.register_task(range(self.iterations + 1), self.update_lr, name="update lr")
+        scheduler.register_task(range(self.iterations + 1), self.count_bits, name="count bits")
         scheduler.register_task(self.when(phases.noise), self.begin_noise, name="begin noise")
         rate = self.config.rate_term
         if self.adaptive:
@@ -167,6 +168,11 @@ class WispStage(Stage):
         for name, rate in self.rates(step, scene.extent).items():
             if name in optimizer.groups:
                 optimizer.set_lr(name, rate)
+
+    def count_bits(self, model: WispModel, step: int) -> None:
+        """Let the bits of some splats be counted at a step where they have a price."""
+        priced = self.price(step) > 0 and step < self.step_of(self.config.phases.freeze)
+        model.counted = self.config.rate_term.sample if priced else 0.0
 
     def begin_noise(self, model: WispModel, cameras: CameraIterator, rasterizer: Rasterizer, scene: Scene) -> None:
         """Draw numbers with uniform noise from here on; the rate model learns what they are like as they stand."""
@@ -377,14 +383,11 @@ class WispStage(Stage):
         total, parts = pack.total, dict(pack.parts)
         if config.loss.opacity and step < self.step_of(config.loss.opacity_stop):
             total = total + config.loss.opacity * result.inputs.opacities.mean()
-        price = self.price(step)
-        if price and step < self.step_of(config.phases.freeze):
-            n = model.num_rows
-            count = max(1, math.ceil(config.rate_term.sample * n))
-            rows = torch.randint(n, (count,), device=model.device)
-            bits = model.bits(rows).sum() / count
+        if "bits" in result.extras:
+            counted = result.extras["bits"]
+            bits = counted.sum() / len(counted)
             parts["bits"] = bits.detach()  # of a splat's 22 numbers
-            total = total + price * n * bits
+            total = total + self.price(step) * model.num_rows * bits
         return LossPack(total, parts)
 
 

@@ -1,0 +1,191 @@
+"""Training speed of wisp by phase, with `fast/` and without, and the operators of a step by part.
+
+    python benchmarks/train_wisp.py --sizes 60000@800x800 --device cuda
+    python benchmarks/train_wisp.py --sizes 8000@128x96 --steps 30 --device cpu --operators
+
+Trains the synthetic scene of benchmarks/scene.py, drawn by itself with other colours, by the stage of wisp with its
+plan shortened so that each phase has some steps: uniform noise with the bits in the loss, soft and hard rounding.
+Nothing is removed, so that all steps have the same splats. Steps a second are those of the second half of a phase, the
+first one warms up. 3DGS, drawing as many, stands beside. --operators counts what torch is asked to do in a step, views
+and empty tensors left out: on a GPU each is at least one launch. Kernels of our own are not among them, but on CUDA the
+profiler counts all launches.
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+from unittest import mock
+
+import torch
+from step_budget import scene_of
+from step_budget import trainer_of as explicit_trainer
+from torch.profiler import ProfilerActivity, profile
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from splatwizard_core.base.random_states import seeded
+from splatwizard_core.plugins.manager import load_plugins
+from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
+from splatwizard_core.scene.images import keep_pictures
+from splatwizard_core.streams import Streams
+from splatwizard_core.training.params import PipelineParams
+from splatwizard_core.training.stage import StageContext
+from splatwizard_core.training.state import TrainingState
+from splatwizard_core.training.trainer import Trainer
+from sw_wisp.config import WispConfig
+from sw_wisp.stage import WispStage
+
+PHASES = ("noise", "soft rounding", "hard rounding")
+PARTS = {
+    "model.gaussians": "splats as drawn",
+    "rasterizer.render": "rasterizer",
+    "stage.loss": "loss",
+    "optimizer.step": "optimizer",
+}
+"""Attribute paths from the training's state -> part of a step; of nested ones the innermost counts."""
+
+
+class Operators(TorchDispatchMode):
+    """Counts operators by the part that runs."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.counts: collections.Counter[str] = collections.Counter()
+        self.names: collections.Counter[str] = collections.Counter()
+        self.part = "backward and the rest"
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        returned = func._schema.returns
+        view = any(r.alias_info is not None and not r.alias_info.is_write for r in returned)
+        if not view and not func.__name__.startswith(("empty", "_local_scalar", "detach", "new_empty")):
+            self.counts[self.part] += 1
+            self.names[func.__name__.split(".")[0]] += 1
+        return func(*args, **(kwargs or {}))
+
+    def watch(self, state: TrainingState) -> None:
+        """Name the parts of a training's steps."""
+        for path, name in PARTS.items():
+            *owners, leaf = path.split(".")
+            owner: Any = state
+            for each in owners:
+                owner = getattr(owner, each)
+            object.__setattr__(owner, leaf, self._named(getattr(owner, leaf), name))
+
+    def _named(self, call: Callable[..., Any], name: str) -> Callable[..., Any]:
+        def named(*args: Any, **kwargs: Any) -> Any:
+            before, self.part = self.part, name
+            try:
+                return call(*args, **kwargs)
+            finally:
+                self.part = before
+
+        return named
+
+
+def trainer_of(n: int, width: int, height: int, steps: int, device: str, kind: str) -> Trainer:
+    """A training of wisp of three phases of `steps` steps each, behind the first."""
+    model, scene, _ = scene_of(n, width, height, device)
+    keep_pictures(scene.train, device)
+    bounds = {"noise": 1, "levels": [], "cells": 2, "place": 10**6, "soft": steps + 1, "hard": 2 * steps + 1}
+    config = WispConfig.model_validate(
+        {
+            "iterations": 18_000,
+            "budget": {"cap": n, "cap_factor": 1.0, "worthless": 0.0},
+            "rate_term": {"start": 1, "ramp": 1},
+            "prune": {"rd": False},
+            "context": {"kind": kind, "fit": 2, "rebuild": 10**6},
+            "positions": {"rule": "mid"},
+            "phases": {**bounds, "freeze": 10**6},
+        }
+    )
+    stage, rasterizer, streams = WispStage(config), NegotiatedRasterizer(load_plugins(), device=device), Streams(0)
+    ppl = PipelineParams(device=device)
+    model = stage.begin(StageContext(model, scene, ppl, rasterizer, streams, lambda name: model))
+    return Trainer(TrainingState.begin(stage, model, scene, ppl, rasterizer, streams))
+
+
+@contextmanager
+def fast_as(wanted: bool) -> Iterator[None]:
+    """Let functions of `fast/` stand in for the plain ones, or not."""
+    with mock.patch.dict(os.environ, {"SW_FAST": "1" if wanted else "0"}):
+        yield
+
+
+def wait(device: str) -> float:
+    """Seconds, when the device has done what it was asked to."""
+    if device == "cuda":
+        torch.cuda.synchronize()
+    return time.perf_counter()
+
+
+def rate(trainer: Trainer, steps: int, device: str) -> float:
+    """Steps a second of the second half."""
+    trainer.run(trainer.state.step + steps // 2, lambda record: None)
+    since = wait(device)
+    trainer.run(trainer.state.step + steps - steps // 2, lambda record: None)
+    return (steps - steps // 2) / (wait(device) - since)
+
+
+def launches(trainer: Trainer, steps: int) -> tuple[float, float]:
+    """Launches a step, and milliseconds of the GPU."""
+    with profile(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA]) as found:
+        trainer.run(trainer.state.step + steps, lambda record: None)
+        torch.cuda.synchronize()
+    kernels = [event for event in found.events() if str(event.device_type).endswith("CUDA")]
+    return len(kernels) / steps, sum(event.time_range.elapsed_us() for event in kernels) / steps / 1e3
+
+
+def measure(n: int, width: int, height: int, args: argparse.Namespace) -> None:
+    watched, rates = min(10, args.steps // 4), {}
+    print(f"{n:,} splats, {width}x{height}, {args.device}")
+    for fast in args.fast:
+        with seeded(0), fast_as(fast):
+            trainer = trainer_of(n, width, height, args.steps, args.device, args.context)
+            for phase in PHASES:
+                rates[fast, phase] = rate(trainer, args.steps - watched - 1, args.device)
+                line = f"  fast {'on ' if fast else 'off'}  {phase:14} {rates[fast, phase]:8.2f} steps/s"
+                if args.device == "cuda":
+                    count, busy = launches(trainer, watched)
+                    line += f"   {count:6.0f} launches, {busy:6.2f} ms of the GPU a step"
+                else:
+                    trainer.run(trainer.state.step + watched, lambda record: None)
+                print(line, flush=True)
+                mode = Operators()
+                if args.operators:
+                    mode.watch(trainer.state)
+                    with mode:
+                        trainer.run_step()
+                    parts = ", ".join(f"{name} {count}" for name, count in mode.counts.most_common())
+                    print(f"    {sum(mode.counts.values())} operators: {parts}")
+                    print("    " + ", ".join(f"{name} {count}" for name, count in mode.names.most_common(12)))
+                else:
+                    trainer.run_step()
+    model, scene, _ = scene_of(n, width, height, args.device)
+    keep_pictures(scene.train, args.device)
+    print(f"  3DGS {rate(explicit_trainer('dense', model, scene, args.device), args.steps, args.device):8.2f} steps/s")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sizes", default="60000@800x800", help="splats and picture, N@WIDTHxHEIGHT")
+    parser.add_argument("--steps", type=int, default=200, help="steps of a phase (default: %(default)s)")
+    parser.add_argument("--context", default="pyramid", choices=["pyramid", "none"])
+    parser.add_argument("--fast", default="on,off", type=lambda text: [each == "on" for each in text.split(",")])
+    parser.add_argument("--operators", action="store_true", help="count operators by part")
+    parser.add_argument("--device", default="cuda", choices=["cuda", "cpu"])
+    args = parser.parse_args()
+    if args.device == "cuda" and not torch.cuda.is_available():
+        sys.exit("torch sees no CUDA device here")
+    for size in args.sizes.split(","):
+        n, width, height = map(int, size.replace("@", "x").split("x"))
+        measure(n, width, height, args)
+
+
+if __name__ == "__main__":
+    main()
