@@ -26,6 +26,13 @@ def register_metrics(registry: Registry) -> None:
     registry.add("ssim_reflect", f"{conventions}:ssim_reflect", label="SSIM, mirrored", digits=4, direction="higher",
                  diagnostic=True,
                  summary="ssim of the picture mirrored at its edge, as torchmetrics averages")  # fmt: skip
+    for name, label, unit, summary in (
+        ("path_distance", "distance", "", "distance of a test camera from the nearest trained one, in their spacings"),
+        ("path_angle", "angle", "deg", "angle of a test view to the training view that looks most alike, degrees"),
+        ("path_combined", "distance and angle", "", "distance / scene extent + angle / 90 degrees, to the nearest"),
+    ):
+        registry.add(name, f"sw_metrics.path_distance:{name}", label=label, unit=unit, digits=2, direction="lower",
+                     diagnostic=True, over="views", summary=summary)  # fmt: skip
 
 
 @hookimpl

@@ -54,7 +54,7 @@ SETTING: Rule = (
     lambda value: isinstance(value, str) and (value == "" or bool(re.fullmatch(r"[\w.]+=\S+", value))),
     'such as "prefixes=8", the setting with which a file has cuts, or "" (always)',
 )
-OVER: Rule = (lambda value: value in ("image", "model"), '"image" or "model"')
+OVER: Rule = (lambda value: value in ("image", "views", "model"), '"image", "views" or "model"')
 CODES: Rule = (lambda value: value in SORTS, f"one of {', '.join(SORTS)}")
 ANY: Rule = (lambda value: True, "")
 
