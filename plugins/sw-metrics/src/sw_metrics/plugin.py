@@ -26,6 +26,22 @@ def register_metrics(registry: Registry) -> None:
     registry.add("ssim_reflect", f"{conventions}:ssim_reflect", label="SSIM, mirrored", digits=4, direction="higher",
                  diagnostic=True,
                  summary="ssim of the picture mirrored at its edge, as torchmetrics averages")  # fmt: skip
+    for name, label, unit, digits, direction, summary in (
+        ("cc_psnr", "PSNR, colour-corrected", "dB", 2, "higher", "psnr after colours are fitted to the photograph, dB"),
+        ("cc_gain", "gain of colour correction", "dB", 2, "lower",
+         "cc_psnr - psnr, dB; below 1 it says nothing about exposure"),
+        ("cc_psnr_channel", "PSNR, channels corrected", "dB", 2, "higher",
+         "psnr after a slope and an offset for each channel, dB"),
+        ("cc_psnr_quad", "PSNR, quadratically corrected", "dB", 2, "higher",
+         "psnr after multinerf's quadratic colour correction, dB"),
+        ("cc_ssim", "SSIM, colour-corrected", "", 4, "higher", "ssim after colours are fitted to the photograph"),
+    ):  # fmt: skip
+        registry.add(name, f"sw_metrics.colour_correction:{name}", label=label, unit=unit, digits=digits,
+                     direction=direction, diagnostic=True, slow=True, summary=summary)  # fmt: skip
+    registry.add("cc_lpips_vgg_3dgs", "sw_metrics.colour_correction:CC_VGG_3DGS", digits=4, direction="lower",
+                 label="LPIPS (VGG, 3DGS), colour-corrected", diagnostic=True, slow=True, group="lpips",
+                 settings="sw_metrics.perceptual:LpipsSettings",
+                 summary="lpips_vgg_3dgs after colours are fitted to the photograph")  # fmt: skip
     for name, label, unit, summary in (
         ("path_distance", "distance", "", "distance of a test camera from the nearest trained one, in their spacings"),
         ("path_angle", "angle", "deg", "angle of a test view to the training view that looks most alike, degrees"),
