@@ -50,23 +50,23 @@ def quadratic(render: Tensor, truth: Tensor) -> Tensor:
     A channel in which fewer than 10 pixels are usable stays as it is.
     """
     check_pair(render, truth)
-    x, y = (image.double().flatten(1).T for image in (render, truth))  # [n,3]
+    x, y = (image.double().flatten(1) for image in (render, truth))  # [3,n]
     free = usable(x) & usable(y)
     for _ in range(ROUNDS):
-        r, g, b = x.unbind(dim=1)
-        features = torch.stack([r * r, r * g, r * b, g * g, g * b, b * b, r, g, b, torch.ones_like(r)], dim=1)
+        r, g, b = x
+        features = torch.stack([r * r, r * g, r * b, g * g, g * b, b * b, r, g, b, torch.ones_like(r)])  # [10,n]
         fitted = []
         for channel in range(3):
-            used = free[:, channel] & usable(x[:, channel])
+            used = free[channel] & usable(x[channel])
             if int(used.sum()) < FEWEST:
-                fitted.append(x[:, channel])
+                fitted.append(x[channel])
                 continue
-            chosen = features * used[:, None]  # faster than to pick the rows
-            gram, moments = (chosen.T @ features).cpu(), (chosen.T @ y[:, channel, None]).cpu()
+            chosen = features * used  # faster than to pick the pixels
+            gram, moments = (chosen @ features.T).cpu(), (chosen @ y[channel, :, None]).cpu()
             weights = torch.linalg.lstsq(gram, moments, driver="gelsd", rcond=1e-15).solution
-            fitted.append((features @ weights.to(features))[:, 0])
-        x = torch.stack(fitted, dim=1).clamp(0, 1)
-    return x.T.reshape(render.shape)
+            fitted.append(weights[:, 0].to(features) @ features)
+        x = torch.stack(fitted).clamp(0, 1)
+    return x.reshape(render.shape)
 
 
 def usable(values: Tensor) -> Tensor:
