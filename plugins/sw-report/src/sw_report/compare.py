@@ -49,8 +49,8 @@ def compare(
 ) -> None:
     """Compare two files of any format or method, or run directories: bytes, attributes, and what they show.
 
-    Errors of attributes are those of B, of explicit Gaussians; rows are matched in order, or each with the nearest that
-    is most alike where the order differs. The PSNR is that of B's pictures against A's, as each file asks to be drawn;
+    Errors of attributes are those of B, of explicit Gaussians; rows are matched in order, or each with the nearest mean
+    where the order differs. The PSNR is that of B's pictures against A's, as each file asks to be drawn;
     on a scene (--scene, or that of a run directory) also of both against the test pictures.
 
     With --published every run under RUN... is put beside published figures, scene by scene, and means over whole data
@@ -154,10 +154,14 @@ def _tell(facts: dict[str, Any]) -> None:
     if attributes is None:
         click.echo(f"no errors of attributes: {facts['no_attributes']}")
         return
-    errors = [[name, f"{e['rms']:.3g}", f"{e['max']:.3g}"] for name, e in attributes["errors"].items()]
-    how = "in order" if attributes["matched"] == "in order" else "with the nearest that is most alike"
+    kinds = {"rms": "RMS", "median": "median", "q99": "99 % below", "max": "largest"}
+    errors = [
+        [name.replace("_", " "), *(f"{e[kind]:.3g}" for kind in kinds)] for name, e in attributes["errors"].items()
+    ]
+    how = "in order" if attributes["matched"] == "in order" else "with the nearest mean"
     click.echo(f"errors of {attributes['rows']:,} Gaussians, matched {how}:")
-    print_table(["", "RMS", "largest"], errors, right=2)
-    if attributes["unpaired"] or any(attributes["left_out"]):
+    print_table(["", *kinds.values()], errors, right=len(kinds))
+    if attributes["taken_twice"] or attributes["never_taken"] or any(attributes["left_out"]):
         left_out = " and ".join(f"{n:,}" for n in attributes["left_out"])
-        click.echo(f"of B {100 * attributes['unpaired']:.1f} % are nobody's partner; not finite: {left_out}")
+        twice, never = attributes["taken_twice"], attributes["never_taken"]
+        click.echo(f"of B {twice:,} were taken more than once, {never:,} never; not finite: {left_out}")
