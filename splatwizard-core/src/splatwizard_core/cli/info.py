@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from splatwizard_core.base.files import write_atomic
 from splatwizard_core.cli import options as shared
 from splatwizard_core.cli.complete import SCENE_OR_FILE
 from splatwizard_core.cli.paths import existing
@@ -15,7 +16,6 @@ from splatwizard_core.cli.setup import Choices, takes_choices
 from splatwizard_core.cli.streams import without_orders
 from splatwizard_core.errors import UserInputError
 from splatwizard_core.plugins import load_plugins
-from splatwizard_native import write_atomic
 
 
 @click.command(short_help="what is in a file or scene")

@@ -52,7 +52,7 @@ ONE_RATE = "r0"  # of a codec without a dial
 
 @dataclass(frozen=True)
 class Plan:
-    """What is asked for.
+    """Models, codecs and views that are asked for.
 
     files       models, of any format that is read here
     codecs      methods that encode a .ply; empty: all that declare `training_free`
@@ -72,7 +72,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class Drawn:
-    """What is drawn of one model at the cameras: uint8 [3,H,W] pictures, and opacities [H,W] in levels."""
+    """Pictures of one model at the cameras: uint8 [3,H,W] pictures, and opacities [H,W] in levels."""
 
     pictures: list[Tensor]
     opacities: list[Tensor]

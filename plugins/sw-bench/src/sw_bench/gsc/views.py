@@ -23,7 +23,7 @@ INSIDE = 0.1  # share of the weight in the inner half of the radius, below which
 
 @dataclass(frozen=True)
 class Asked:
-    """What the user says about the views.
+    """Wishes of the user about the views.
 
     cameras     a scene's folder or a file of cameras; None: the model's comments, or generated ones
     views       "all", "every<n>", or names or numbers with commas; None: a scene's test views, else all
