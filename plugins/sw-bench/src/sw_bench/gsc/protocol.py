@@ -125,9 +125,7 @@ def codecs_of(plan: Plan, session: Session) -> list[Entry]:
         wanted.append(plan.anchor)
     found = [methods.entry(name) for name in dict.fromkeys(wanted)]
     if others := [entry.name for entry in found if not entry.declared.get("training_free")]:
-        raise UserInputError(
-            f"{', '.join(others)}: a method that has to train; this protocol takes those that need not"
-        )
+        raise UserInputError(f"{', '.join(others)} has to train, and this protocol is for what need not")
     return found
 
 
@@ -151,11 +149,9 @@ def open_source(name: str, file: Path, plan: Plan, session: Session, resolved: R
     model = session.plugins.read_gaussians(file)
     if not model.num_rows:
         raise UserInputError(f"{file}: it holds no Gaussian")
-    broken = [each for each in model.RAW if not bool(torch.isfinite(getattr(model, each)).all())]
-    if broken:
-        raise UserInputError(
-            f"{file}: {', '.join(broken)} hold values that are not finite: `sw convert` leaves them out"
-        )
+    left_out = model.origin.get("left_out", {}) if isinstance(model.origin, dict) else {}
+    if broken := model.check_finite() + int(left_out.get("not_finite", 0)):
+        raise UserInputError(f"{file}: {broken:,} Gaussians hold values that are not finite")
     clipped = clipped_attributes(model)
     if clipped and plan.range == "fixed":
         raise UserInputError(f"{file}: the ranges of gsc-quant would clip {', '.join(clipped)}; leave range=fixed out")

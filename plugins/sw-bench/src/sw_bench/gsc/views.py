@@ -222,9 +222,7 @@ def _chosen(found: Views, asked: str) -> Views:
         elif word.isdigit() and int(word) < len(found.names):
             kept.append(int(word))
         else:
-            raise UserInputError(
-                f"--views: there is no view '{word}'; there are {len(found.names)}: a number or a name"
-            )
+            raise UserInputError(f"--views: there is no view '{word}' among {len(found.names)}: give numbers or names")
     if not kept:
         raise UserInputError("--views is empty: give all, every<n>, or names with commas")
     return found.part(list(dict.fromkeys(kept)))
