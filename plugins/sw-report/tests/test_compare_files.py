@@ -221,6 +221,24 @@ def test_models_without_attributes_are_seen_by_given_cameras(tmp_path: Path, cap
     assert facts["psnr"]["views"] == 1
 
 
+def test_along_a_path_the_flicker_is_told(tmp_path: Path, capsys, folder: Path):
+    entries = [
+        {"width": 32, "height": 24, "fx": 30, "fy": 30, "position": [0.05 * t, 0, -4],
+         "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]} for t in range(4)
+    ]  # fmt: skip
+    (tmp_path / "path.json").write_text(json.dumps(entries))
+    words = (folder / "a.ply", folder / "b.ply", "--cameras", tmp_path / "path.json", "--path")
+    found = run(capsys, *words)["psnr"]["path"]
+    assert found["frames"] == 4
+    assert 0 < found["flicker"] < 50
+    assert found["popping_a"] >= 1
+    same = run(capsys, words[0], *words[0:1], *words[2:])["psnr"]["path"]
+    assert (same["flicker"], same["flicker1"], same["psnr"]) == (0, 0, None)
+    assert main(["compare", *map(str, words)]) == 0
+    assert "along the path, 4 frames: flicker" in " ".join(capsys.readouterr().out.split())
+    assert main(["compare", str(words[0]), str(words[1]), "--path"]) == 2
+
+
 def test_a_run_directory_brings_its_scene(tmp_path: Path, capsys, folder: Path):
     (tmp_path / "config.toml").write_text('method = "3dgs"\nscene = "demo:tiny"\niterations = 3\n')
     arguments = ["encode", str(folder / "a.ply"), "--method", "3dgs", "--rate", "r6", "--out"]
