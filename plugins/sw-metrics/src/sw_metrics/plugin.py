@@ -42,6 +42,32 @@ def register_metrics(registry: Registry) -> None:
                  label="LPIPS (VGG, 3DGS), colour-corrected", diagnostic=True, slow=True, group="lpips",
                  settings="sw_metrics.perceptual:LpipsSettings",
                  summary="lpips_vgg_3dgs after colours are fitted to the photograph")  # fmt: skip
+    for name, label, direction, digits, summary in (
+        (
+            "flip",
+            "FLIP",
+            "lower",
+            4,
+            "FLIP (LDR) of NVIDIA, by flip-evaluator: visible differences when two pictures alternate",
+        ),
+        ("ms_ssim", "MS-SSIM", "higher", 4, "multi-scale SSIM, by piq"),
+        ("haarpsi", "HaarPSI", "higher", 4, "Haar wavelet similarity, by piq"),
+        ("fsim", "FSIMc", "higher", 4, "feature similarity with colour, by piq"),
+        ("vsi", "VSI", "higher", 4, "visual saliency similarity, by piq"),
+        ("gmsd", "GMSD", "lower", 4, "deviation of gradient magnitude similarity, by piq"),
+        (
+            "cvvdp",
+            "ColorVideoVDP",
+            "higher",
+            2,
+            "ColorVideoVDP in JOD on a display, by cvvdp: 10 means no visible difference",
+        ),
+    ):
+        given = (
+            {"settings": f"sw_metrics.vision_models:{name.capitalize()}Settings"} if name in ("flip", "cvvdp") else {}
+        )
+        registry.add(name, f"sw_metrics.vision_models:{name.upper()}", label=label, digits=digits,
+                     direction=direction, diagnostic=True, slow=True, summary=summary, **given)  # fmt: skip
     for name, label, unit, summary in (
         ("path_distance", "distance", "", "distance of a test camera from the nearest trained one, in their spacings"),
         ("path_angle", "angle", "deg", "angle of a test view to the training view that looks most alike, degrees"),
@@ -61,3 +87,5 @@ def register_downloads(registry: Registry) -> None:
 def register_checks(registry: Registry) -> None:
     registry.add("LPIPS", "sw_metrics.check:check_lpips", group="metrics", needs="torch",
                  summary="the package lpips and its weights")  # fmt: skip
+    registry.add("vision models", "sw_metrics.check:check_vision_models", group="metrics", needs="torch",
+                 summary="the packages of FLIP, MS-SSIM and others, ColorVideoVDP")  # fmt: skip
