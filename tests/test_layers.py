@@ -57,7 +57,7 @@ LIBRARIES = {
     "sw_rasterizers", "sw_codecs", "sw_gaussians", "sw_anchors", "sw_reference", "sw_interchange", "sw_view",
     "sw_report",
 }  # fmt: skip
-"""Packages that others may import when they declare them; of sw_report the file format of published figures alone."""
+"""Packages that others may import when they declare them; of sw_report the format of published figures and BD-rates."""
 EXTENDS = {"sw_hac_plus": "sw_hac"}
 """Method -> the method that it builds on, and so imports."""
 ABOUT_RUNS = {

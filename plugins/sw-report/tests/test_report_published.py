@@ -68,6 +68,12 @@ def test_what_differs_is_named(runs, changes, told):
     assert told in found.differences
 
 
+@pytest.mark.parametrize("split", ["sparse:9", "sector:60@120", "block:0of4", "file+sector:90@40"])
+def test_nothing_published_stands_beside_a_split_that_holds_out_places(runs, split):
+    (run,) = runs(protocol={**PROTOCOL, "split": split})
+    assert beside(run.facts, "bonsai", read_published()) == []
+
+
 def test_steps_count_those_of_the_scene_that_a_training_started_from(runs):
     (run,) = runs(train={**STEPS, "steps": 5000, "pretraining": {"3dgs": {"steps": 30_000}}})
     assert steps_of(run.facts) == 35_000

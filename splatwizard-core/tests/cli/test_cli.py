@@ -288,6 +288,19 @@ def test_info_of_a_scene_as_json(capsys: pytest.CaptureFixture[str]):
     assert facts["views"] == {"train": 4, "test": 4}
 
 
+def test_info_draws_a_split_from_above(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["info", "demo:tiny", "--split", "block:0of4", "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert (facts["views"], facts["pictures"]) == ({"train": 6, "test": 2}, ["demo-tiny-block-0of4.svg"])
+    assert facts["protocol"].endswith("/block:0of4/black/pp-center/q8/pts-train")
+    assert (tmp_path / "demo-tiny-block-0of4.svg").read_text().count("<path") == 8
+    assert main(["info", "demo:tiny", "--split", "block:0of4", "--set", "split=every2"]) == 2
+    assert "--split block:0of4 contradicts" in capsys.readouterr().err
+    assert main(["info", "demo:tiny"]) == 0
+    assert len(list(tmp_path.iterdir())) == 1  # nothing is drawn that was not asked for
+
+
 def test_info_of_a_file_lists_bytes_that_sum_to_its_size(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     from splatwizard_core.coding.container import ContainerWriter
 

@@ -34,6 +34,10 @@ def leaving(subject: Any) -> MetricResult:
     raise SystemExit(3)
 
 
+def places(subject: Any) -> MetricResult:
+    return MetricResult(1.5, [1.0, 2.0], "lower")
+
+
 def picture(render: Any, truth: Any) -> float:
     return 1.0
 
@@ -73,6 +77,15 @@ def test_one_that_breaks_costs_its_own_value_alone(registry):
     )
     assert found["lacking"].reason == "package-missing: get one"
     assert all("failed" in (found[name].reason or "") for name in ("nan", "odd", "leaving"))
+
+
+def test_one_over_views_is_asked_always_and_keeps_its_values(registry):
+    declared = {"direction": "lower", "over": "views", "diagnostic": True}
+    registry._entries["places"] = Entry("metric", "places", f"{__name__}:places", "", declared, "sw-toy", "1.0")
+    assert [e.name for e in chosen_metrics(registry, None, geometry=False)] == ["places", "psnr"]
+    assert quick_metrics(registry) == ["psnr"]
+    found = evaluate_model(SimpleNamespace(), chosen_metrics(registry, None, geometry=False))
+    assert found == {"places": MetricResult(1.5, [1.0, 2.0], "lower", diagnostic=True)}
 
 
 def test_one_that_does_not_apply_is_in_no_result(registry):

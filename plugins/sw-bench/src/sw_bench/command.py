@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from splatwizard_core.tooling import (
+    EXISTING,
     config_option,
     debug_option,
     device_option,
@@ -28,7 +29,7 @@ from splatwizard_core.tooling import (
 
 
 @click.command(short_help="a sweep of methods, scenes, rate points and seeds")
-@click.argument("plan", metavar="[PLAN.toml]", required=False, type=click.Path(dir_okay=False))
+@click.argument("paths", metavar="[PLAN.toml | FILE...]", nargs=-1, type=click.Path(dir_okay=False))
 @options(
     methods_option, scene_option, rates_option, seeds_option, preset_option, images_option, init_option, config_option,
     set_option,
@@ -51,14 +52,39 @@ from splatwizard_core.tooling import (
                  help="Further starts of a process that was killed."),
     click.option("--train-shared", nargs=2, hidden=True, type=click.Path(), metavar="FILE ROOT",
                  help="Used by sweeps: train what several runs start from.  [default: none]"),
+    click.option("--protocol", type=click.Choice(["mpeg-gsc"]),
+                 help="Code trained models FILE... by methods that need no training, after the MPEG GSC exploration "
+                 "(2025), own renderer and cameras."),
+    click.option("--cameras", metavar="PATH", type=EXISTING,
+                 help="With --protocol: a scene's folder or a file of cameras.  [default: those of FILE's comments, "
+                 "else 16 around or in the model]"),
+    click.option("--views", metavar="NAMES", help="With --protocol: all, every<n>, or views with commas.  [default: a "
+                 "scene's test views, else all]"),
+    click.option("--size", metavar="WxH", help="With --protocol: of pictures from cameras without a size.  [default: "
+                 "1280x720]"),
     json_option, debug_option,
 )  # fmt: skip
-def bench(plan: str | None, train_shared: tuple[str, str] | None, **given: Any) -> None:
+def bench(paths: tuple[str, ...], train_shared: tuple[str, str] | None, **given: Any) -> None:
     """Run a sweep: every method of PLAN on every scene, at every rate point, with every seed.
 
     Without a PLAN the options are one, with comma lists; with one, --method, --scene and --seed choose a part of it.
     What is finished is not done again, what was interrupted goes on, what failed is tried again: give the same command.
+
+    With --protocol mpeg-gsc, FILE... are trained models, and --method names codecs (default: all that train nothing).
+    Further -o KEY=VALUE: anchor, path (auto, orbit16, inside16), up (x,y,z or auto), quaternion (w2c, c2w), range
+    (auto, fixed). Written are gsc.csv, gsc_bd.csv and gsc.json.
     """
+    of_protocol = {name: given.pop(name) for name in ("protocol", "cameras", "views", "size")}
+    if of_protocol.pop("protocol") is not None:
+        from sw_bench.gsc.command import bench_models
+
+        bench_models(paths, given, **of_protocol)
+        return
+    if alone := [name for name, value in of_protocol.items() if value is not None]:
+        raise click.UsageError(f"--{alone[0]} is for --protocol mpeg-gsc")
+    if len(paths) > 1:
+        raise click.UsageError("give one PLAN.toml; several models are for --protocol mpeg-gsc")
+    plan = paths[0] if paths else None
     if train_shared is not None:
         from sw_bench.shared import train_shared as train
 

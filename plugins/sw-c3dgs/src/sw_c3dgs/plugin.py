@@ -7,7 +7,7 @@ from splatwizard_core.api import Registry, hookimpl
 def register_methods(registry: Registry) -> None:
     registry.add("c3dgs", "sw_c3dgs.method:C3DGS", title="C3DGS",
                  summary="C3DGS (Niedermayr et al. 2024): codebooks of colours and shapes by sensitivity, 8 bits",
-                 presets=["paper", "quick"], rates=["r1", "r2", "r3", "r4", "r5"],
+                 presets=["paper", "quick"], rates=["r1", "r2", "r3", "r4", "r5"], training_free=True,
                  published="sw_c3dgs:published.toml")  # fmt: skip
 
 

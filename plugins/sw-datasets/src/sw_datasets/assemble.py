@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,9 +13,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from splatwizard_core.api import Camera, PointCloud, Protocol, Scene, SceneError, View
+from splatwizard_core.api import Camera, ConfigError, PointCloud, Protocol, Scene, SceneError, View
 from sw_datasets.name_lists import NameLists, lists_beside, lists_id, read_lists, split_by_lists
-from sw_datasets.splits import is_rule, split_views
+from sw_datasets.splits import holds_out_places, is_rule, split_scene
 
 FAR_OUT = 100.0
 """Distance of the cameras from the origin, in sizes of the scene, from which they are moved: float32 coordinates there
@@ -33,6 +33,7 @@ def assemble_scene(
     views: Sequence[View],
     *,
     points: PointCloud | None,
+    train_points: Callable[[Sequence[View]], PointCloud] | None = None,
     protocol: Protocol,
     path: str | None = None,
     own_split: tuple[Sequence[View], Sequence[View]] | None = None,
@@ -45,6 +46,7 @@ def assemble_scene(
 
     views, points   may have poses and positions in float64: those far from the origin are moved to a local one, which
                     the scene keeps (`Scene.origin`)
+    train_points    gives those of the start points that these training views alone would bring; None: nobody knows
     own_split   (train, test) that the files themselves define, taken when the split is "file"
     own_lists   names of views in the scene's own files, taken like train.txt and test.txt beside it
     finds_lists the scene's own lists are taken before `protocol.split`, which the user did not ask for
@@ -89,9 +91,19 @@ def assemble_scene(
             if not train or not test:
                 raise SceneError(f"its own split has {len(train)} views to train and {len(test)} to test; both need 1")
         else:
-            train, test = split_views(views, protocol.split)
+            train, test, rule = split_scene(views, protocol.split, own_split)
+            protocol = replace(protocol, split=rule)
     except SceneError as error:
         raise refused(error) from error
+    protocol, kept = points_of_training(protocol, points, train, train_points)
+    if points is not None and kept is not points:
+        if not len(kept):
+            raise refused(f"no training view saw any of the {len(points):,} start points; points = all uses them")
+        if len(kept) < len(points):
+            notes.append(f"{len(kept):,} of {len(points):,} start points are used: those that training views saw")
+        points = kept
+    elif protocol.points == "all" and points is not None:
+        notes.append("the start points may be of the held-out views too (no tracks, or points = all)")
     origin = local_origin(views, points)
     if any(origin):
         notes.append(
@@ -129,6 +141,33 @@ def assemble_scene(
         reason = "there is one training camera" if len(train) == 1 else "all training cameras stand at one place"
         notes.append(f"{reason}: the scene extent is set to 1.0, which scales learning rates and thresholds")
     return scene
+
+
+def points_of_training(
+    protocol: Protocol,
+    points: PointCloud | None,
+    train: Sequence[View],
+    train_points: Callable[[Sequence[View]], PointCloud] | None,
+) -> tuple[Protocol, PointCloud | None]:
+    """The protocol with its rule for start points, and the points that it leaves.
+
+    Without a wish (`protocol.points`), a split that holds out places keeps those that training views saw, where that is
+    known. Raises ConfigError where it is asked for and not known.
+    """
+    wish = protocol.points or ("train" if holds_out_places(protocol.split) else "")
+    if wish == "train" and train_points is None and points is not None:
+        if protocol.points:
+            raise ConfigError(
+                "points = train-tracks: nothing tells which views saw the start points (COLMAP's points3D does)",
+                key="points",
+            )
+        wish = "all"
+    if wish == "all" and not holds_out_places(protocol.split):
+        wish = ""
+    protocol = replace(protocol, points=wish)
+    if wish != "train" or points is None or train_points is None:
+        return protocol, points
+    return protocol, train_points(train)
 
 
 def split_file(split: str, scene: Path | None) -> Path | None:

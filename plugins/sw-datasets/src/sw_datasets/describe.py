@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from typing import Any
 
 from splatwizard_core.api import Scene
+from sw_datasets.plan_view import plan_view
 
 
 def describe(scene: Scene) -> dict[str, Any]:
@@ -20,6 +22,7 @@ def describe(scene: Scene) -> dict[str, Any]:
     extent          world units, from the training cameras
     origin          where the scene's origin lies in the world of its files; absent at 0
     masks, ground_truth, warnings
+    pictures        file name -> text of a picture: the cameras from above
     """
     views = list({id(view): view for view in (*scene.train, *scene.test)}.values())
     cameras = [view.camera for view in views]
@@ -53,6 +56,7 @@ def describe(scene: Scene) -> dict[str, Any]:
         "masks": sum(view.load_mask is not None for view in views),
         "ground_truth": sorted(scene.ground_truth),
         "warnings": list(scene.warnings),
+        "pictures": {re.sub(r"[^\w.-]+", "-", f"{scene.name}-{protocol.split}") + ".svg": plan_view(scene)},
     }
 
 

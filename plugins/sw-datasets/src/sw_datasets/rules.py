@@ -21,6 +21,7 @@ class Rules:
     images      picture folder; None: the layout has none to choose
     masked      pictures are cut out by alpha or mask; None: by alpha, if the family composites it
     exif_turn   as in SceneOptions
+    points      as in Protocol, "train" or "all"; empty: as the split asks
     finds_lists lists of names in the scene decide its split, as the user named none and nothing is published
     the rest    as in Protocol
     """
@@ -36,6 +37,7 @@ class Rules:
     masked: bool | None
     composite8: bool
     exif_turn: bool | None
+    points: str = ""
     finds_lists: bool = False
 
     @property
@@ -74,6 +76,7 @@ class Rules:
             masked=masked,
             composite8=self.composite8,
             turned=turned,
+            points=self.points,
             name="custom" if masked or turned else self.name,
         )
 
@@ -120,6 +123,7 @@ def rules_for(family: Family, folder: str, options: SceneOptions) -> Rules:
         options.mask_background,
         options.legacy_8bit_composite,
         options.exif_turn,
+        (options.points or "").removesuffix("-tracks"),
         finds_lists=options.split is None and options.test_every is None and not family.scenes,
     )
 

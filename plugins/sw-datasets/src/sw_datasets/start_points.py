@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,16 @@ from sw_gaussians.memory_map import memory_map
 from sw_gaussians.ply_tables import MAX_HEADER, read_header, read_tables
 from torch import Tensor
 
-from splatwizard_core.api import SH_C0, BitstreamError, Camera, PointCloud, SceneError, stream
+from splatwizard_core.api import (
+    SH_C0,
+    BitstreamError,
+    Camera,
+    PointCloud,
+    SceneError,
+    SceneOptions,
+    View,
+    stream,
+)
 
 HALF_CUBE = 1.3  # start points of Blender scenes fill [-1.3, 1.3]^3 (3DGS)
 DEPTHS = (0.8, 1.2)  # others lie about the distance at which the cameras' axes meet
@@ -66,6 +75,11 @@ def points_in_sight(cameras: Sequence[Camera], count: int, seed: int) -> PointCl
     ray = torch.stack([x, y, torch.ones_like(u)], dim=1)
     xyz = near[which] + depth[:, None] * (ray[:, None, :] @ R[which])[:, 0] + middle
     return PointCloud(xyz, torch.full((count, 3), 0.5))
+
+
+def points_in_sight_of(options: SceneOptions) -> Callable[[Sequence[View]], PointCloud]:
+    """Views -> `points_in_sight` of their cameras, as many and as drawn as the options ask."""
+    return lambda views: points_in_sight([view.camera for view in views], options.init_points, options.seed)
 
 
 def share_in_sight(points: Tensor, cameras: Sequence[Camera]) -> float:

@@ -101,3 +101,21 @@ class CompressedPly(FormatMethod):
 
     name: ClassVar[str] = "compressed-ply"
     Config = CompressedPlyConfig
+
+
+class GscQuantConfig(FormatConfig):
+    """Everything that can be set for gsc-quant."""
+
+    codec: CodecChoice = Field(CodecChoice(name="gsc-quant"), description="what writes the file")
+
+
+class GscQuant(FormatMethod):
+    """The quantiser of the MPEG GSC exploration, and our lossless coder: an anchor; r5 has the exploration's bits."""
+
+    name: ClassVar[str] = "gsc-quant"
+    Config = GscQuantConfig
+    RATES: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        f"r{i}": {"codec.settings.position_bits": position, "codec.settings.bits": bits}
+        for i, (position, bits) in enumerate(((14, 6), (15, 7), (16, 8), (17, 10), (18, 12)), 1)
+    }
+    DEFAULT_RATE: ClassVar[str] = "r5"

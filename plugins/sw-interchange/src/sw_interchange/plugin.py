@@ -45,16 +45,19 @@ def register_importers(registry: Registry) -> None:
 @hookimpl
 def register_methods(registry: Registry) -> None:
     registry.add("spz", "sw_interchange.methods:Spz", title="SPZ",
-                 summary="a trained 3DGS scene as .spz (Niantic)",
+                 summary="a trained 3DGS scene as .spz (Niantic)", training_free=True,
                  presets=["paper", "quick"], rates=["r1", "r2", "r3"])  # fmt: skip
     registry.add("sog", "sw_interchange.methods:Sog", title="SOG",
-                 summary="a trained 3DGS scene as .sog (PlayCanvas)",
+                 summary="a trained 3DGS scene as .sog (PlayCanvas)", training_free=True,
                  presets=["paper", "quick"], rates=["r1", "r2", "r3"])  # fmt: skip
     registry.add("splat", "sw_interchange.methods:Splat", summary="a trained 3DGS scene as .splat (antimatter15)",
-                 presets=["paper", "quick"], rates=["r1"])  # fmt: skip
+                 training_free=True, presets=["paper", "quick"], rates=["r1"])  # fmt: skip
     registry.add("compressed-ply", "sw_interchange.methods:CompressedPly", title="compressed PLY",
-                 summary="a trained 3DGS scene as compressed .ply (PlayCanvas)",
+                 summary="a trained 3DGS scene as compressed .ply (PlayCanvas)", training_free=True,
                  presets=["paper", "quick"], rates=["r1"])  # fmt: skip
+    registry.add("gsc-quant", "sw_interchange.methods:GscQuant", title="GSC quantiser", training_free=True,
+                 summary="a trained 3DGS scene by the quantiser of the MPEG GSC exploration (2025), coded without loss",
+                 presets=["paper", "quick"], rates=["r1", "r2", "r3", "r4", "r5"])  # fmt: skip
 
 
 @hookimpl
@@ -67,3 +70,5 @@ def register_coders(registry: Registry) -> None:
                  summary="the bytes of a .splat: 32 a Gaussian, no SH")  # fmt: skip
     registry.add("compressed-ply", "sw_interchange.codecs:CompressedPlyCodec", codes="gaussians",
                  summary="the bytes of a compressed .ply: quantised in chunks of 256")  # fmt: skip
+    registry.add("gsc-quant", "sw_interchange.gsc_quant:GscQuantCodec", codes="gaussians",
+                 summary="the quantiser of the MPEG GSC exploration, octree and columns without loss")  # fmt: skip

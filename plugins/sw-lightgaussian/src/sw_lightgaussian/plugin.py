@@ -7,7 +7,7 @@ from splatwizard_core.api import Registry, hookimpl
 def register_methods(registry: Registry) -> None:
     registry.add("lightgaussian", "sw_lightgaussian.method:LightGaussian", title="LightGaussian",
                  summary="LightGaussian (Fan et al. 2024): prune, distil to SH degree 2, vector-quantise",
-                 presets=["paper", "quick"], rates=["r1", "r2", "r3", "r4", "r5"], bd_anchor=2,
+                 presets=["paper", "quick"], rates=["r1", "r2", "r3", "r4", "r5"], training_free=True, bd_anchor=2,
                  published="sw_lightgaussian:published.toml")  # fmt: skip
 
 

@@ -11,6 +11,7 @@ from sw_metrics.lpips_weights import BACKBONES, find_weights, hub_folder, read_w
 from sw_metrics.packaged_weights import unlike_published
 from sw_metrics.perceptual import fitting_torchvision, install_command, package_version
 from sw_metrics.torchvision_import import import_torchvision
+from sw_metrics.vision_models import METRICS
 
 GROUP = "metrics"
 
@@ -48,6 +49,20 @@ def check_lpips() -> list[Check]:
         else:
             checks.append(Check(GROUP, name, "broken", f"{path} is not the published file: its checksum differs", get))
     return checks
+
+
+def check_vision_models() -> list[Check]:
+    """Tell which of the packages that metrics go through are here; none of them is needed."""
+    checks = []
+    for metric in dict.fromkeys(METRICS.values()):
+        names = ", ".join(name for name, each in METRICS.items() if each.extra == metric.extra)
+        version = metric.version()
+        if version is None:
+            found = Check(GROUP, metric.package, "missing", f"for {names}", f"pip install 'sw-metrics[{metric.extra}]'")
+        else:
+            found = Check(GROUP, metric.package, "ok", f"{metric.package} {version}, for {names}")
+        checks.append(found)
+    return list({check.name: check for check in checks}.values())
 
 
 def _holds_weights(path: Path, net: str) -> bool:

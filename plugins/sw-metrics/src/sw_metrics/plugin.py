@@ -26,6 +26,55 @@ def register_metrics(registry: Registry) -> None:
     registry.add("ssim_reflect", f"{conventions}:ssim_reflect", label="SSIM, mirrored", digits=4, direction="higher",
                  diagnostic=True,
                  summary="ssim of the picture mirrored at its edge, as torchmetrics averages")  # fmt: skip
+    for name, label, unit, digits, direction, summary in (
+        ("cc_psnr", "PSNR, colour-corrected", "dB", 2, "higher", "psnr after colours are fitted to the photograph, dB"),
+        ("cc_gain", "gain of colour correction", "dB", 2, "lower",
+         "cc_psnr - psnr, dB; below 1 it says nothing about exposure"),
+        ("cc_psnr_channel", "PSNR, channels corrected", "dB", 2, "higher",
+         "psnr after a slope and an offset for each channel, dB"),
+        ("cc_psnr_quad", "PSNR, quadratically corrected", "dB", 2, "higher",
+         "psnr after multinerf's quadratic colour correction, dB"),
+        ("cc_ssim", "SSIM, colour-corrected", "", 4, "higher", "ssim after colours are fitted to the photograph"),
+    ):  # fmt: skip
+        registry.add(name, f"sw_metrics.colour_correction:{name}", label=label, unit=unit, digits=digits,
+                     direction=direction, diagnostic=True, slow=True, summary=summary)  # fmt: skip
+    registry.add("cc_lpips_vgg_3dgs", "sw_metrics.colour_correction:CC_VGG_3DGS", digits=4, direction="lower",
+                 label="LPIPS (VGG, 3DGS), colour-corrected", diagnostic=True, slow=True, group="lpips",
+                 settings="sw_metrics.perceptual:LpipsSettings",
+                 summary="lpips_vgg_3dgs after colours are fitted to the photograph")  # fmt: skip
+    for name, label, direction, digits, summary in (
+        (
+            "flip",
+            "FLIP",
+            "lower",
+            4,
+            "FLIP (LDR) of NVIDIA, by flip-evaluator: visible differences when two pictures alternate",
+        ),
+        ("ms_ssim", "MS-SSIM", "higher", 4, "multi-scale SSIM, by piq"),
+        ("haarpsi", "HaarPSI", "higher", 4, "Haar wavelet similarity, by piq"),
+        ("fsim", "FSIMc", "higher", 4, "feature similarity with colour, by piq"),
+        ("vsi", "VSI", "higher", 4, "visual saliency similarity, by piq"),
+        ("gmsd", "GMSD", "lower", 4, "deviation of gradient magnitude similarity, by piq"),
+        (
+            "cvvdp",
+            "ColorVideoVDP",
+            "higher",
+            2,
+            "ColorVideoVDP in JOD on a display, by cvvdp: 10 means no visible difference",
+        ),
+    ):
+        given = (
+            {"settings": f"sw_metrics.vision_models:{name.capitalize()}Settings"} if name in ("flip", "cvvdp") else {}
+        )
+        registry.add(name, f"sw_metrics.vision_models:{name.upper()}", label=label, digits=digits,
+                     direction=direction, diagnostic=True, slow=True, summary=summary, **given)  # fmt: skip
+    for name, label, unit, summary in (
+        ("path_distance", "distance", "", "distance of a test camera from the nearest trained one, in their spacings"),
+        ("path_angle", "angle", "deg", "angle of a test view to the training view that looks most alike, degrees"),
+        ("path_combined", "distance and angle", "", "distance / scene extent + angle / 90 degrees, to the nearest"),
+    ):
+        registry.add(name, f"sw_metrics.path_distance:{name}", label=label, unit=unit, digits=2, direction="lower",
+                     diagnostic=True, over="views", summary=summary)  # fmt: skip
 
 
 @hookimpl
@@ -38,3 +87,5 @@ def register_downloads(registry: Registry) -> None:
 def register_checks(registry: Registry) -> None:
     registry.add("LPIPS", "sw_metrics.check:check_lpips", group="metrics", needs="torch",
                  summary="the package lpips and its weights")  # fmt: skip
+    registry.add("vision models", "sw_metrics.check:check_vision_models", group="metrics", needs="torch",
+                 summary="the packages of FLIP, MS-SSIM and others, ColorVideoVDP")  # fmt: skip

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -16,19 +15,21 @@ from splatwizard_core.api import GaussianModel, rgb_to_dc
 
 Array = NDArray[np.float64]
 
-NEIGHBORS = 8
-"""Of B, looked at for each Gaussian of A where the orders differ: the one that is most alike is its partner."""
-DISTINCT = 0.01
-"""Difference of log scales from which on an axis has a direction of its own: those of a sphere have none."""
+TIED = 8
+"""Gaussians of B at one place that are told apart by likeness, where the orders differ."""
+SAMPLED, AGREE = 10_000, 0.99
+"""Rows that are looked at to see whether the orders agree, and the share that must be nearest to their own row."""
 FLAT = -20.0
 """Log scale of a surfel along its normal, as files with three scales have it."""
 
 
 @dataclass(frozen=True)
 class Error:
-    """Root mean square and largest absolute value of the differences."""
+    """Root mean square, median, 99 % quantile and largest of the absolute differences."""
 
     rms: float
+    median: float
+    q99: float
     max: float
 
 
@@ -36,20 +37,22 @@ class Error:
 class AttributeErrors:
     """Errors of A against its partners in B.
 
-    matched     "in order", or "nearest": by position, then by likeness
+    matched     "in order", or "nearest": by the means
     rows        Gaussians compared
     left_out    of A and B, with values that are not finite
-    unpaired    share of B that is nobody's partner, 0 .. 1
+    taken_twice, never_taken    how many of B are the partner of several Gaussians of A, and of none
     extent      diagonal of the box that holds the middle 90 % of A, world units
-    errors      "position" (world units), "log_scale" and "rotation" (the largest angle of an axis, degrees), once axes
-                and signs are matched, "covariance" (Frobenius norm, relative to that of A), "opacity" and "color" (SH
-                band 0; 1 is the range of a picture), "sh" (higher coefficients; missing ones are 0)
+    errors      "position" (world units), "log_scale" (the three of each, sorted), "log_covariance" (Frobenius norm of
+                the difference of R diag(ln s) R^T, which no order of axes and no sign changes), "covariance" (the same
+                of R diag(s^2) R^T, relative to A), "opacity" and "color" (SH band 0; 1 is the range of a picture), "sh"
+                (higher coefficients; missing ones are 0)
     """
 
     matched: str
     rows: int
     left_out: tuple[int, int]
-    unpaired: float
+    taken_twice: int
+    never_taken: int
     extent: float
     errors: dict[str, Error]
 
@@ -65,14 +68,16 @@ def attribute_errors(a: GaussianModel, b: GaussianModel) -> AttributeErrors | No
         return None
     matched, partner = _partners(ours, theirs)
     theirs_matched = theirs.rows(partner)
+    taken = np.bincount(partner, minlength=len(theirs.means))
     low, high = np.percentile(ours.means, [5, 95], axis=0)
-    log_scales, angles = _same_axes(ours, theirs_matched)
     covariance = ours.covariances() - theirs_matched.covariances()
     size = np.linalg.norm(ours.covariances(), axis=(1, 2))
     found = {
         "position": _error(np.linalg.norm(ours.means - theirs_matched.means, axis=1)),
-        "log_scale": _error(ours.log_scales - log_scales),
-        "rotation": _error(angles),
+        "log_scale": _error(np.sort(ours.log_scales, axis=1) - np.sort(theirs_matched.log_scales, axis=1)),
+        "log_covariance": _error(
+            np.linalg.norm(ours.log_covariances() - theirs_matched.log_covariances(), axis=(1, 2))
+        ),
         "covariance": _error(np.linalg.norm(covariance, axis=(1, 2)) / np.maximum(size, 1e-300)),
         "opacity": _error(ours.opacities - theirs_matched.opacities),
         "color": _error(ours.colors - theirs_matched.colors),
@@ -82,7 +87,8 @@ def attribute_errors(a: GaussianModel, b: GaussianModel) -> AttributeErrors | No
         matched=matched,
         rows=len(ours.means),
         left_out=(a.num_rows - len(ours.means), b.num_rows - len(theirs.means)),
-        unpaired=1 - len(np.unique(partner)) / len(theirs.means),
+        taken_twice=int((taken > 1).sum()),
+        never_taken=int((taken == 0).sum()),
         extent=float(np.linalg.norm(high - low)),
         errors=found,
     )
@@ -126,27 +132,10 @@ class _Columns:
         """[n,3,3]."""
         return covariances_of(self.quats, np.exp(self.log_scales))
 
-
-def _same_axes(a: _Columns, b: _Columns) -> tuple[Array, Array]:
-    """Log scales [n,3] of `b` by the axes of `a`, and the largest angle between these, degrees [n].
-
-    An ellipsoid has 24 pairs of scales and a quaternion: its axes in any order, each in either direction. Of the six
-    orders the one is taken that is most alike in scales and directions. An axis with the scale of another has no
-    direction, and no angle.
-    """
-    turned = np.einsum("nki,nkj->nij", _rotations(a.quats), _rotations(b.quats))  # cosines: axis i of a, j of b
-    cosines = np.minimum(np.abs(turned), 1.0)
-    best, order = np.full(len(a.means), np.inf), np.zeros((len(a.means), 3), dtype=np.intp)
-    axes = np.arange(3)
-    for each in itertools.permutations(range(3)):
-        unlike = np.abs(a.log_scales - b.log_scales[:, each]).sum(axis=1) + (1 - cosines[:, axes, each]).sum(axis=1)
-        order = np.where((unlike < best)[:, None], np.array(each), order)
-        best = np.minimum(unlike, best)
-    rows = np.arange(len(a.means))[:, None]
-    apart = np.abs(a.log_scales[:, :, None] - a.log_scales[:, None, :]) + np.diag([np.inf] * 3)
-    has_direction = apart.min(axis=2) > DISTINCT
-    angles = np.degrees(np.arccos(cosines[rows, axes, order]))
-    return b.log_scales[rows, order], np.where(has_direction, angles, 0.0).max(axis=1)
+    def log_covariances(self) -> Array:
+        """[n,3,3] R diag(ln s) R^T."""
+        axes = _rotations(self.quats)
+        return np.einsum("nij,nj,nkj->nik", axes, self.log_scales, axes)
 
 
 def _rotations(quats: Array) -> Array:
@@ -161,25 +150,31 @@ def _rotations(quats: Array) -> Array:
 
 
 def _partners(a: _Columns, b: _Columns) -> tuple[str, NDArray[np.intp]]:
-    """Pair the rows: "in order" or "nearest", and the row of `b` for each of `a`."""
+    """Pair the rows: "in order" or "nearest", and the row of `b` for each of `a`.
+
+    The orders agree if the counts do and 99 % of 10,000 evenly spaced rows have no nearer row than their own. Else the
+    nearest mean is taken; where several are equally near (coincident Gaussians), the one that is most alike.
+    """
     tree = cKDTree(b.means)
-    near, candidates = tree.query(a.means, k=min(NEIGHBORS, len(b.means)))
-    near, candidates = near.reshape(len(a.means), -1), candidates.reshape(len(a.means), -1)
     if len(a.means) == len(b.means):
-        apart = np.linalg.norm(a.means - b.means, axis=1)
-        # Rows that a coder moved are nearly as near as the nearest; of another order they are as far as any two.
-        if apart.mean() <= 4 * near[:, 0].mean() + 1e-12:
+        rows = np.unique(np.linspace(0, len(a.means) - 1, min(SAMPLED, len(a.means))).astype(np.intp))
+        nearest, _ = tree.query(a.means[rows])
+        own = np.linalg.norm(a.means[rows] - b.means[rows], axis=1)
+        if (own <= nearest).mean() >= AGREE:
             return "in order", np.arange(len(a.means))
-    # Where Gaussians lie closer than a coder moves them, the nearest is often another: likeness decides.
-    unlike = near / max(float(np.median(near[:, 0])), 1e-12 + float(np.ptp(a.means, axis=0).max()) * 1e-6) / 4
+    near, candidates = tree.query(a.means, k=min(TIED, len(b.means)))
+    near, candidates = near.reshape(len(a.means), -1), candidates.reshape(len(a.means), -1)
+    order = np.argsort(candidates, axis=1)  # so that of those alike the lowest row is taken
+    near, candidates = (np.take_along_axis(each, order, axis=1) for each in (near, candidates))
+    unlike = np.where(near <= near.min(axis=1, keepdims=True), 0.0, np.inf)
     for column in ("log_scales", "opacities", "colors"):
-        ours, theirs = getattr(a, column), getattr(b, column)
-        if column == "log_scales":  # in whatever order the axes are
-            ours, theirs = np.sort(ours, axis=1), np.sort(theirs, axis=1)
-        theirs = theirs[candidates]
+        ours, theirs = getattr(a, column), getattr(b, column)[candidates]
         unlike = unlike + abs(theirs - ours[:, None]).reshape(*candidates.shape, -1).sum(axis=2)
     return "nearest", candidates[np.arange(len(candidates)), unlike.argmin(axis=1)]
 
 
 def _error(differences: Array) -> Error:
-    return Error(float(np.sqrt((differences**2).mean())), float(abs(differences).max()))
+    """Summarise differences, one per row or several."""
+    sizes = abs(differences)
+    middle, high = np.quantile(sizes, [0.5, 0.99])
+    return Error(float(np.sqrt((sizes**2).mean())), float(middle), float(high), float(sizes.max()))

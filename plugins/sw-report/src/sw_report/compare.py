@@ -39,18 +39,28 @@ GENERATED, SIZE = 12, (512, 512)
         help="JSON of the cameras to draw from (README of sw-view).  [default: the scene's test views; without a "
         "scene 12 cameras around the Gaussians]",
     ),
+    click.option(
+        "--path", "is_path", is_flag=True,
+        help="The cameras of --cameras are the frames of a path with a fixed step: tell of flicker and popping too.",
+    ),
     click.option("--published", is_flag=True, help="Compare runs with published figures of their data set and scene."),
     click.option("--own", is_flag=True, help="Published figures of the measured methods alone."),
     device_option, json_option, debug_option,
 )  # fmt: skip
 @takes_choices
 def compare(
-    paths: tuple[Path, ...], cameras: Path | None, published: bool, own: bool, as_json: bool, chosen: Choices
+    paths: tuple[Path, ...],
+    cameras: Path | None,
+    is_path: bool,
+    published: bool,
+    own: bool,
+    as_json: bool,
+    chosen: Choices,
 ) -> None:
     """Compare two files of any format or method, or run directories: bytes, attributes, and what they show.
 
-    Errors of attributes are those of B, of explicit Gaussians; rows are matched in order, or each with the nearest that
-    is most alike where the order differs. The PSNR is that of B's pictures against A's, as each file asks to be drawn;
+    Errors of attributes are those of B, of explicit Gaussians; rows are matched in order, or each with the nearest mean
+    where the order differs. The PSNR is that of B's pictures against A's, as each file asks to be drawn;
     on a scene (--scene, or that of a run directory) also of both against the test pictures.
 
     With --published every run under RUN... is put beside published figures, scene by scene, and means over whole data
@@ -65,7 +75,9 @@ def compare(
         raise click.UsageError("give two files (or run directories) A and B, or --published with any number of runs")
     if own:
         raise click.UsageError("--own is for --published")
-    print_facts(_compared(paths[0], paths[1], cameras, chosen), as_json, _tell)
+    if is_path and cameras is None:
+        raise click.UsageError("--path is for --cameras FILE")
+    print_facts(_compared(paths[0], paths[1], cameras, chosen, is_path=is_path), as_json, _tell)
 
 
 def _beside_published(folders: tuple[Path, ...], own: bool, as_json: bool) -> None:
@@ -82,7 +94,7 @@ def _beside_published(folders: tuple[Path, ...], own: bool, as_json: bool) -> No
     print_facts({"tables": [to_dict(table) for table in tables], "notes": collection.notes}, as_json, told)
 
 
-def _compared(a: Path, b: Path, camera_file: Path | None, chosen: Choices) -> dict[str, Any]:
+def _compared(a: Path, b: Path, camera_file: Path | None, chosen: Choices, *, is_path: bool) -> dict[str, Any]:
     from splatwizard_core.api import GaussianModel, UserInputError
     from splatwizard_core.tooling import load_plugins, open_session
     from sw_report.attribute_errors import attribute_errors
@@ -115,7 +127,7 @@ def _compared(a: Path, b: Path, camera_file: Path | None, chosen: Choices) -> di
         "attributes": errors and errors.as_dict(),
         "no_attributes": reason,
         "cameras": seen_from,
-        "psnr": compare_pictures(left, right, places, _with_pictures(test)),
+        "psnr": compare_pictures(left, right, places, _with_pictures(test), is_path=is_path),
     }
 
 
@@ -151,13 +163,24 @@ def _tell(facts: dict[str, Any]) -> None:
     print_table(["", "A", "B"], rows)
     seen = f"{psnr['views']} cameras ({facts['cameras']})"
     click.echo(f"B against A: {psnr['mean']:.2f} dB, at least {psnr['least']:.2f} dB, from {seen}")
+    if "path" in psnr:
+        path = psnr["path"]
+        told = {name: "-" if path[name] is None else f"{path[name]:.3g}" for name in path}
+        click.echo(
+            f"along the path, {told['frames']} frames: flicker {told['flicker']} levels (of first differences "
+            f"{told['flicker1']}), PSNR {told['psnr']} dB, popping {told['popping_a']} of A, {told['popping_b']} of B"
+        )
     if attributes is None:
         click.echo(f"no errors of attributes: {facts['no_attributes']}")
         return
-    errors = [[name, f"{e['rms']:.3g}", f"{e['max']:.3g}"] for name, e in attributes["errors"].items()]
-    how = "in order" if attributes["matched"] == "in order" else "with the nearest that is most alike"
+    kinds = {"rms": "RMS", "median": "median", "q99": "99 % below", "max": "largest"}
+    errors = [
+        [name.replace("_", " "), *(f"{e[kind]:.3g}" for kind in kinds)] for name, e in attributes["errors"].items()
+    ]
+    how = "in order" if attributes["matched"] == "in order" else "with the nearest mean"
     click.echo(f"errors of {attributes['rows']:,} Gaussians, matched {how}:")
-    print_table(["", "RMS", "largest"], errors, right=2)
-    if attributes["unpaired"] or any(attributes["left_out"]):
+    print_table(["", *kinds.values()], errors, right=len(kinds))
+    if attributes["taken_twice"] or attributes["never_taken"] or any(attributes["left_out"]):
         left_out = " and ".join(f"{n:,}" for n in attributes["left_out"])
-        click.echo(f"of B {100 * attributes['unpaired']:.1f} % are nobody's partner; not finite: {left_out}")
+        twice, never = attributes["taken_twice"], attributes["never_taken"]
+        click.echo(f"of B {twice:,} were taken more than once, {never:,} never; not finite: {left_out}")

@@ -39,11 +39,18 @@ class Beside:
     differences: tuple[str, ...]
 
 
+UNPUBLISHED_SPLITS = ("sparse:", "sector:", "block:")
+"""How splits begin that published figures do not stand beside: views are numbered or chosen otherwise there."""
+
+
 def beside(facts: RunFacts, scene: str | None, figures: Sequence[Figure]) -> list[Beside]:
     """Find the figures of a run's method for a scene of its data set (None: the mean over it).
 
-    Where its rate point has a published one, those alone; else all of the method.
+    Where its rate point has a published one, those alone; else all of the method. None beside splits that hold out
+    places, which no paper has.
     """
+    if str(facts.rules().get("split", "")).removeprefix("file+").startswith(UNPUBLISHED_SPLITS):
+        return []
     of_method = [f for f in figures if (f.method, f.dataset, f.scene) == (facts.method, facts.dataset, scene)]
     same = [f for f in of_method if f.rate is not None and f.rate == facts.rate]
     return [Beside(f, bool(same), tuple(differences(facts, f))) for f in same or of_method]

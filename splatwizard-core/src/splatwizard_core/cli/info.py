@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from splatwizard_core.base.files import write_atomic
 from splatwizard_core.cli import options as shared
 from splatwizard_core.cli.complete import SCENE_OR_FILE
 from splatwizard_core.cli.paths import existing
@@ -19,6 +20,7 @@ from splatwizard_core.plugins import load_plugins
 
 @click.command(short_help="what is in a file or scene")
 @click.argument("path", metavar="PATH", type=SCENE_OR_FILE)
+@click.option("--split", metavar="RULE", help="Split a scene by this rule, and draw its cameras from above: an .svg.")
 @shared.options(shared.images_option, shared.set_option, shared.json_option, shared.debug_option)
 @takes_choices
 def info(path: str, as_json: bool, chosen: Choices) -> None:
@@ -96,7 +98,6 @@ def _gaussian_facts(path: Path) -> dict[str, Any]:
 
     model = read_gaussians(existing(path), load_plugins())
     means, scales, opacities = model.means.detach(), model.scales.detach(), model.opacities.detach()
-    known = bool(model.num_rows)  # else there is no box and no median
     facts = dict(model.origin)
     left = facts.pop("left_out", {"not_finite": 0, "zero_rotation": 0})
     return {
@@ -106,9 +107,9 @@ def _gaussian_facts(path: Path) -> dict[str, Any]:
         **model.counts(),
         **left,
         "sh_degree": model.max_sh_degree,
-        "box": {"min": means.amin(0).tolist(), "max": means.amax(0).tolist()} if known else None,
-        "median_scale": float(scales.median()) if known else None,
-        "median_opacity": float(opacities.median()) if known else None,
+        "box": {"min": means.amin(0).tolist(), "max": means.amax(0).tolist()} if model.num_rows else None,
+        "median_scale": float(scales.median()) if model.num_rows else None,
+        "median_opacity": float(opacities.median()) if model.num_rows else None,
     }
 
 
@@ -117,8 +118,11 @@ def _scene_facts(spec: str, chosen: Choices) -> dict[str, Any]:
 
     plugins = load_plugins()
     scene = load_scene(spec, chosen.resolve_without_method().scene, plugins)
-    found: list[dict[str, Any]] = plugins.hook.describe_scene(scene=scene)
-    return {"name": scene.name} | {name: value for facts in found for name, value in facts.items()}
+    facts = {"name": scene.name} | {k: v for each in plugins.hook.describe_scene(scene=scene) for k, v in each.items()}
+    pictures: dict[str, str] = facts.pop("pictures", {})
+    for name, text in pictures.items() if chosen.split else ():
+        write_atomic(Path(name), text)
+    return facts | ({"pictures": [*pictures]} if chosen.split else {})
 
 
 def _print_file(facts: dict[str, Any]) -> None:

@@ -30,6 +30,7 @@ class Choices:
     methods: tuple[str, ...] = ()
     scene: str | None = None
     images: str | None = None
+    split: str | None = None
     rate: str | None = None
     preset: str | None = None
     init: str | None = None
@@ -44,9 +45,8 @@ class Choices:
         from splatwizard_core.runs.config import parse_set
 
         given: dict[str, Any] = dict(parse_set(self.sets))
-        for key in ("images", "device", "seed", "init"):
-            value = getattr(self, key)
-            if value is None:
+        for key in ("images", "split", "device", "seed", "init"):
+            if (value := getattr(self, key)) is None:
                 continue
             if str(given.get(key, value)) != str(value):
                 raise ConfigError(f"--{key} {value} contradicts --set {key}={given[key]}: give one of them", key=key)

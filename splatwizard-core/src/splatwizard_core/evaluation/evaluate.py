@@ -220,17 +220,17 @@ def evaluate(
 
 
 def evaluate_model(subject: Subject, entries: Sequence[Entry]) -> dict[str, MetricResult]:
-    """Measure by those over models that apply to the scene; one that breaks or lacks something only has a reason."""
+    """Measure by those over views and models that apply to it; one that breaks or lacks something only has a reason."""
     found = {}
-    for entry in (e for e in entries if MetricInfo.of(e).over == "model"):
+    for entry in (e for e in entries if MetricInfo.of(e).over != "image"):
         missing: dict[str, str] = {}
         info = MetricInfo.of(entry)
         with noting_failure(entry, missing):
-            if (result := entry.load()(subject)) is not None:
-                told = json.loads(json.dumps([result.mean, dict(result.details)], allow_nan=False))
-                found[entry.name] = MetricResult(told[0], [], info.direction, result.reason, details=told[1])
+            if (it := entry.load()(subject)) is not None:
+                mean, each, more = json.loads(json.dumps([it.mean, it.per_view, dict(it.details)], allow_nan=False))
+                found[entry.name] = MetricResult(mean, each, info.direction, it.reason, info.diagnostic, details=more)
         if missing:
-            found[entry.name] = MetricResult(None, [], info.direction, missing[entry.name])
+            found[entry.name] = MetricResult(None, [], info.direction, missing[entry.name], info.diagnostic)
     return found
 
 

@@ -49,7 +49,7 @@ class MetricInfo:
     slow        left out of evaluations during a training
     unrounded   gets the render as it is, not rounded to 8 bit
     settings    "module:Model", the pydantic model of its settings; empty: it has none
-    over        "image", or "model": (evaluate.Subject) -> evaluate.MetricResult, or None where it does not apply
+    over        "image"; or "views" (where they lie) and "model": (Subject) -> MetricResult, None: does not apply
     """
 
     label: str
@@ -138,18 +138,18 @@ class MetricFactory(Protocol):
 
 
 AnyMetric = Metric | MetricFactory | Callable[[Any], Any]
-"""The target of a metric's entry; of one over models, the last."""
+"""The target of a metric's entry; of one over views or models, the last."""
 
 
 def quick_metrics(registry: TypedRegistry[AnyMetric]) -> list[str]:
     """Names of the metrics that are computed during training: the quick ones whose value the log is read for."""
     infos = {entry.name: MetricInfo.of(entry) for entry in registry}
-    return [name for name, info in infos.items() if not (info.diagnostic or info.slow or info.over == "model")]
+    return [name for name, info in infos.items() if not (info.diagnostic or info.slow or info.over != "image")]
 
 
 def chosen_metrics(registry: TypedRegistry[Any], names: Iterable[str] | None, *, geometry: bool) -> list[Entry]:
-    """The metrics of an evaluation: those named (None: all over images), with `geometry` all over models besides."""
-    wanted = [e.name for e in registry if MetricInfo.of(e).over == "image"] if names is None else [*names]
+    """The metrics of an evaluation: those named (None: all but those over models), with `geometry` those besides."""
+    wanted = [e.name for e in registry if MetricInfo.of(e).over != "model"] if names is None else [*names]
     wanted += [e.name for e in registry if geometry and MetricInfo.of(e).over == "model"]
     return [registry.entry(name) for name in dict.fromkeys(wanted)]
 

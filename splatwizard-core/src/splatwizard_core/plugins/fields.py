@@ -36,8 +36,8 @@ def _wanted(field: str, value: Any) -> str | None:
     are_texts = all(isinstance(each, str) for each in texts)
     if field == "direction" and value not in ("higher", "lower"):
         return "'higher' or 'lower'"
-    if field == "over" and value not in ("image", "model"):
-        return "'image' or 'model'"
+    if field == "over" and value not in ("image", "views", "model"):
+        return "'image', 'views' or 'model'"
     if field in TEXTS and not isinstance(value, str):
         return "a text"
     if field in NUMBERS and not isinstance(value, (int, float)):

@@ -40,7 +40,7 @@ REGISTERED = {
     "methods": "Add methods: subclasses of splatwizard_core.api.Method, with their presets and rate points.",
     "datasets": "Add dataset families: objects with detect(path) -> score and load(path, options) -> Scene.",
     "metrics": (
-        "Add metrics: callables (render [3,H,W], truth [3,H,W]) -> float or factories of them; or `over` models."
+        "Add metrics: callables (render [3,H,W], truth [3,H,W]) -> float or factories of them; or `over` views, models."
     ),
     "exporters": "Add exporters: callables (model, path) that write an interchange format, with its file name suffix.",
     "importers": (

@@ -153,7 +153,7 @@ def measure(
         visible_gaussians=result.visible_gaussians,
         drawn_gaussians=result.drawn_gaussians,
         renders=result.renders,
-        geometry={name: dict(m.details) for name, m in of_model.items()} or None,
+        geometry={name: dict(m.details) for name, m in of_model.items() if not m.per_view} or None,
         training_psnr=of_training,
         unknown={f"metrics.{name}.mean": m.reason for name, m in results if m.reason is not None} | reasons,
         digest=model.digest(),

@@ -17,18 +17,13 @@ class SceneOptions:
     protocol        "survey" or "inria": which named choice of pictures the family's defaults follow (None: "survey")
     images          picture folder of a COLMAP scene, such as "images_2"
     resolution      -1 (1600 px rule), 1, 2, 4, 8, or a width in pixels
-    test_every      every n-th view by name is a test view: split "every<n>" in short
-    split           "every8" and the like, "lod:30", "file", "all", or the path of a file of view names
-    background      "black" or "white"
-    principal_point "center" or "file"
-    mask_background pictures are cut out by alpha or mask (alpha times colour on the background); False: alpha is a
-                    mask only. Blender scenes are always cut out
-    legacy_8bit_composite   Blender pictures are composited on the background at load, in 8 bit with truncation, as the
-                    3DGS code does; False: in float where they are used
-    exif_turn       whether EXIF turns pictures whose size does not say if poses were made from turned ones; None: it
-                    does not, and that is told
-    init_points     how many random start points where there is no SfM
-    seed            of those points
+    split           "every8" (test_every=8 in short) and the like, "file", "all", or the path of a file of view names
+    points          which start points are used: "all", or those that training views saw ("train-tracks")
+    background, principal_point    "black" or "white"; "center" or "file"
+    mask_background pictures are cut out by alpha or mask, those of Blender scenes always; False: alpha is a mask only
+    legacy_8bit_composite   Blender pictures are composited in 8 bit with truncation (3DGS code); False: in float
+    exif_turn       whether EXIF turns pictures whose size does not tell; None: it does not, with a warning
+    init_points, seed   how many random start points where there is no SfM, and their seed
     """
 
     protocol: Literal["survey", "inria"] | None = None
@@ -36,6 +31,7 @@ class SceneOptions:
     resolution: int | None = None
     test_every: int | None = None
     split: str | None = None
+    points: Literal["all", "train-tracks"] | None = None
     background: Literal["black", "white"] | None = None
     principal_point: Literal["center", "file"] | None = None
     mask_background: bool | None = None

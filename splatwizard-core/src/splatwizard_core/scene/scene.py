@@ -90,14 +90,14 @@ class Protocol:
     images      picture folder
     resolution  the rule of specs: -1, 1, 2, 4, 8 or a width
     split       "every<n>", "lod:<k>", "file", "all", or "names-<hash>" of lists of names
+    points      "train": start points that only held-out views saw are gone, "all": they are not; "": no matter
     background  "black" or "white"
     principal_point "center" or "file" (COLMAP's own)
     quantize8   renders are rounded to 8 bit before metrics
     masked      pictures were cut out by alpha or mask, beyond what the layout always does
     composite8  pictures with alpha were composited in 8 bit with truncation
     turned      pictures were turned by EXIF because the user said so (`exif_turn`), not their size
-    name        "survey" or "inria" where all of the above is what that named protocol says of a published scene, else
-                "custom"; equal facts are comparable whatever the name, so it is no part of the id
+    name        "survey" or "inria" where the above is that protocol's for a published scene, else "custom"; not in ids
     """
 
     dataset: str
@@ -110,6 +110,7 @@ class Protocol:
     masked: bool = False
     composite8: bool = False
     turned: bool = False
+    points: str = ""
     name: str = "custom"
 
     @property
@@ -119,7 +120,7 @@ class Protocol:
             self.dataset, self.images, f"r{self.resolution}", self.split, self.background,
             f"pp-{self.principal_point}", "q8" if self.quantize8 else "float",
         ]  # fmt: skip
-        more = {"masked": self.masked, "composite8": self.composite8, "turned": self.turned}
+        more = {n: getattr(self, n) for n in ("masked", "composite8", "turned")} | {f"pts-{self.points}": self.points}
         return "/".join(parts + [name for name, holds in more.items() if holds])
 
 

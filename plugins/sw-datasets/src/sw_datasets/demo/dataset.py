@@ -38,6 +38,7 @@ class DemoDataset:
             split=rules.split,
             source_size=(size.width, size.height),
             resolution=rules.resolution,
+            points=rules.points,
         )
         scene.warnings += unused_option_warnings(options, UNUSED_OPTIONS, DEMO)
         return scene

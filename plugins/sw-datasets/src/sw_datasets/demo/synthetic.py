@@ -224,6 +224,7 @@ def make_scene(
     split: str | None = None,
     source_size: tuple[int, int] | None = None,
     resolution: int = -1,
+    points: str = "",
 ) -> Scene:
     """The demo scene, of the size asked for. Pictures are drawn or read on first use; equal arguments give equal bits.
 
@@ -231,6 +232,7 @@ def make_scene(
     background      "black" or "white", behind the stage
     split           see splits.py; None: every `size.test_every`-th view by name is a test view
     resolution      as in the protocol, only recorded here; `size` is what is drawn
+    points          as in the protocol: "train" draws start points that the training views see
     """
     size = size or DemoSize()
     world = build_world(seed)
@@ -247,12 +249,16 @@ def make_scene(
         name,
         views,
         points=start_points(world, cameras, size.points, generator),
+        train_points=lambda train: start_points(
+            world, [view.camera for view in train], size.points, stream(init_seed, "demo-points")
+        ),
         protocol=Protocol(
             "demo",
             images=f"{width}x{height}",
             resolution=resolution,
             split=split or f"every{size.test_every}",
             background=background,
+            points=points,
         ),
         ground_truth={
             "points": torch.from_numpy(xyz.T.astype(np.float32)),

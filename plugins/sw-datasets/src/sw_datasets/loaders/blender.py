@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from splatwizard_core.api import PointCloud, Scene, SceneError, SceneOptions
+from splatwizard_core.api import PointCloud, Scene, SceneError, SceneOptions, View
 from sw_datasets.assemble import assemble_scene
 from sw_datasets.families import BLENDER
 from sw_datasets.image_checks import Gate
@@ -65,6 +66,7 @@ def load_blender(path: Path, rules: Rules, options: SceneOptions) -> Scene:
         path.resolve().name,
         train.views + test.views,
         points=points,
+        train_points=None if train.cloud or cloud_beside(path) else lambda views: _random_points(views, options)[0],
         protocol=rules.protocol("rgba", masked=gate.masked, turned=gate.turned),
         path=str(path),
         own_split=(train.views, test.views),
@@ -79,12 +81,18 @@ def _start_points(path: Path, train: Frames, options: SceneOptions, warnings: li
         points = read_cloud(cloud)
         warnings.append(f"the {len(points):,} start points are those of {cloud.name}")
         return points
+    points, told = _random_points(train.views, options)
+    warnings += told
+    return points
+
+
+def _random_points(views: Sequence[View], options: SceneOptions) -> tuple[PointCloud, list[str]]:
+    """(random points, warnings): in the cube that Blender scenes fill, or where the cameras look instead."""
     points = random_points(options.init_points, options.seed)
-    cameras = [view.camera for view in train.views]
+    cameras = [view.camera for view in views]
     if cameras and share_in_sight(points.xyz[:1000], cameras) < FEWEST_IN_SIGHT:
-        warnings.append(
+        return points_in_sight(cameras, options.init_points, options.seed), [
             "the cameras do not look at the cube [-1.3, 1.3]^3, which Blender scenes fill: the "
             f"{options.init_points:,} random start points are laid where they look"
-        )
-        return points_in_sight(cameras, options.init_points, options.seed)
-    return points
+        ]
+    return points, []

@@ -6,20 +6,20 @@ import contextlib
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from splatwizard_core.api import Camera, PointCloud, Scene, SceneError, SceneOptions
+from splatwizard_core.api import Camera, PointCloud, Scene, SceneError, SceneOptions, View
 from sw_datasets.assemble import assemble_scene
 from sw_datasets.families import COLMAP
 from sw_datasets.image_checks import Gate
 from sw_datasets.loaders.colmap_model import ColmapCamera, ColmapImage, ColmapPoints, count_images, read_model
 from sw_datasets.picture_names import SUFFIXES, find_pictures, list_pictures, name_key, view_name
 from sw_datasets.rules import Rules, rules_for, unused_option_warnings
-from sw_datasets.start_points import cloud_beside, points_in_sight, read_cloud
+from sw_datasets.start_points import cloud_beside, points_in_sight_of, read_cloud
 
 PLAIN_FOCALS = {"SIMPLE_PINHOLE": 1, "PINHOLE": 2}
 RADIAL_FOCALS = {
@@ -101,6 +101,13 @@ def load_colmap(path: Path, rules: Rules, options: SceneOptions, *, masks: MaskF
         views.append(gate.view(name, picture, camera, mask))
     warnings += gate.warnings()
     points = point_cloud(model.points) if len(model.points) else None
+    of_training: Callable[[Sequence[View]], PointCloud] | None = None
+    if points is not None and len(model.points.track):  # of a thinned model the tracks are often gone
+        ids = {name: image.id for name, image in zip(names, images, strict=True)}
+
+        def of_training(train: Sequence[View]) -> PointCloud:
+            return point_cloud(model.points, {ids[view.name] for view in train})
+
     if points is None:
         cloud = cloud_beside(folder) or cloud_beside(path)
         if cloud is not None:
@@ -108,7 +115,8 @@ def load_colmap(path: Path, rules: Rules, options: SceneOptions, *, masks: MaskF
             warnings.append(f"points3D has no point: {len(points):,} start points are those of {cloud.name}")
     unused = ("legacy_8bit_composite", "init_points") if points is not None else ("legacy_8bit_composite",)
     if points is None:
-        points = points_in_sight([view.camera for view in views], options.init_points, options.seed)
+        of_training = points_in_sight_of(options)
+        points = of_training(views)
         warnings.append(
             f"the reconstruction has no 3D points: {options.init_points:,} random ones are laid where the cameras "
             "look (init_points = N)"
@@ -118,6 +126,7 @@ def load_colmap(path: Path, rules: Rules, options: SceneOptions, *, masks: MaskF
         path.resolve().name,
         views,
         points=points,
+        train_points=of_training,
         protocol=rules.protocol(masked=gate.masked, turned=gate.turned),
         path=str(path),
         warnings=warnings,
@@ -212,10 +221,15 @@ def pose(image: ColmapImage) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.from_numpy(R), torch.tensor(image.tvec, dtype=torch.float64)
 
 
-def point_cloud(points: ColmapPoints) -> PointCloud:
-    """Points (float64) and colours (float32) of a model."""
+def point_cloud(points: ColmapPoints, seen_by: Collection[int] | None = None) -> PointCloud:
+    """Points (float64) and colours (float32) of a model; `seen_by`: those that at least one of these images saw."""
     rgb = torch.from_numpy(points.rgb.astype(np.float32) / 255)
-    return PointCloud(torch.from_numpy(points.xyz.astype(np.float64)), rgb)
+    cloud = PointCloud(torch.from_numpy(points.xyz.astype(np.float64)), rgb)
+    if seen_by is None:
+        return cloud
+    by_them = np.concatenate([[0], np.isin(points.track[:, 0], list(seen_by)).cumsum()])  # observations before a row
+    kept = torch.from_numpy(np.diff(by_them[points.track_start]) > 0)
+    return PointCloud(cloud.xyz[kept], rgb[kept])
 
 
 def mask_files(path: Path, names: Sequence[str]) -> list[Path | None]:

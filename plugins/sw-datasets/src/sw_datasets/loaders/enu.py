@@ -23,7 +23,7 @@ from sw_datasets.image_checks import Gate
 from sw_datasets.loaders.transforms import unused_keys
 from sw_datasets.picture_names import list_pictures
 from sw_datasets.rules import Rules, unused_option_warnings
-from sw_datasets.start_points import points_in_sight
+from sw_datasets.start_points import points_in_sight_of
 
 POSES = "poses_enu.json"
 
@@ -67,7 +67,8 @@ def load_enu(path: Path, rules: Rules, options: SceneOptions) -> Scene:
     return assemble_scene(
         path.resolve().name,
         views,
-        points=points_in_sight([view.camera for view in views], options.init_points, options.seed),
+        points=points_in_sight_of(options)(views),
+        train_points=points_in_sight_of(options),
         protocol=rules.protocol(masked=gate.masked, turned=gate.turned),
         path=str(path),
         warnings=warnings,

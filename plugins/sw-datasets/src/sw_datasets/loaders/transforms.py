@@ -28,7 +28,7 @@ from sw_datasets.name_lists import NameLists
 from sw_datasets.picture_names import SUFFIXES, find_each, find_pictures, is_inside, view_name
 from sw_datasets.pictures import read_header
 from sw_datasets.rules import rules_for, unused_option_warnings
-from sw_datasets.start_points import cloud_beside, points_in_sight, read_cloud
+from sw_datasets.start_points import cloud_beside, points_in_sight_of, read_cloud
 
 FILE = "transforms.json"
 
@@ -93,6 +93,7 @@ class TransformsDataset:
             path.resolve().name,
             found.views,
             points=points,
+            train_points=None if found.cloud is not None else points_in_sight_of(options),
             protocol=rules.protocol("frames", masked=gate.masked, turned=gate.turned),
             path=str(path),
             own_lists=found.lists,
@@ -108,8 +109,7 @@ def start_of(path: Path, found: Frames, options: SceneOptions) -> tuple[PointClo
     if found.cloud is not None:
         points = read_cloud(found.cloud)
         return points, [f"the {len(points):,} start points are those of {found.cloud.name}"]
-    points = points_in_sight([view.camera for view in found.views], options.init_points, options.seed)
-    return points, [
+    return points_in_sight_of(options)(found.views), [
         f"there are no start points: {options.init_points:,} random ones are laid where the cameras look "
         "(init_points = N)"
     ]

@@ -67,7 +67,7 @@ def check_pruner(entry: Entry, plugins: PluginManager) -> str:
 def check_metric(entry: Entry, plugins: PluginManager) -> str:
     """Hold a metric to one finite number, repeatable, on images that stay as they are, in the declared direction."""
     target = entry.load()
-    if entry.declared.get("over") == "model":
+    if entry.declared.get("over") in ("views", "model"):
         return _check_model_metric(entry, plugins)
     try:
         prepared = target.prepare(MetricSetup(CPU)) if hasattr(target, "prepare") else PreparedMetric(target)

@@ -54,7 +54,7 @@ SETTING: Rule = (
     lambda value: isinstance(value, str) and (value == "" or bool(re.fullmatch(r"[\w.]+=\S+", value))),
     'such as "prefixes=8", the setting with which a file has cuts, or "" (always)',
 )
-OVER: Rule = (lambda value: value in ("image", "model"), '"image" or "model"')
+OVER: Rule = (lambda value: value in ("image", "views", "model"), '"image", "views" or "model"')
 CODES: Rule = (lambda value: value in SORTS, f"one of {', '.join(SORTS)}")
 ANY: Rule = (lambda value: True, "")
 
@@ -66,7 +66,7 @@ METRIC: dict[str, Rule] = {
 FIELDS: Mapping[str, Mapping[str, Rule]] = {
     "method": {
         "presets": NAMES, "rates": NAMES, "bd_anchor": COUNT, "default": FLAG, "published": FIGURES, "title": TEXT,
-        "prefixes": SETTING,
+        "prefixes": SETTING, "training_free": FLAG,
     },
     "metric": METRIC,
     "coder": {"codes": CODES, "available": WHERE, "stores": TEXT, "prefixes": SETTING},

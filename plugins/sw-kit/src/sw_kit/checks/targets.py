@@ -48,7 +48,7 @@ def check_target(entry: Entry, plugins: PluginManager) -> str:
         _takes(target.prepare, 1, f"{whose}: prepare")
         _takes(target.identity, 1, f"{whose}: identity")
         return "gets ready with prepare(setup)"
-    if entry.kind == "metric" and entry.declared.get("over") == "model":
+    if entry.kind == "metric" and entry.declared.get("over") in ("views", "model"):
         _takes(target, 1, whose)
         return "takes a subject"
     if entry.kind in ARGUMENTS:
