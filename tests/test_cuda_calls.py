@@ -462,6 +462,44 @@ def test_shared_colours_and_radii(drawn):
     assert drawn["visible_radii"][0].scale_columns == 3
 
 
+def test_wisp(calls, monkeypatch):
+    from sw_wisp.appearance import AppearanceNetwork
+    from sw_wisp.context import ContextNetworks
+    from sw_wisp.fast import predicted
+    from sw_wisp.fast.splats import drawable
+    from sw_wisp.pyramid import FEATURES
+    from sw_wisp.rounding import SOFT, Rounding
+
+    places = predicted._tie_places
+    monkeypatch.setattr(predicted, "_tie_places", lambda device: places(torch.device("cpu")))
+    values, networks = rand(7, 22, grad=True), ContextNetworks()
+    networks.rounds = True
+    given = (rand(7, FEATURES), rand(7, FEATURES), values, Rounding(SOFT, 3.0))
+    forecast, drawn = predicted.predicted(networks, *given, moves_steps=False)
+    assert not forecast.steps.requires_grad
+    (weights,) = calls["eight_bits"]
+    assert (weights.count, weights.lowest, list(weights.rows[:3]), weights.rows[13]) == (13, -12, [32, 3, 48], 0)
+    assert [(call.block, call.phase, call.sharpness) for call in calls["draw"]] == [(b, 2, 3.0) for b in range(4)]
+    assert {call.rows for call in calls["draw"]} == {7}
+    found = torch.autograd.grad(drawn, (values, *networks.parameters()), rand(7, 22))
+    assert [each.shape for each in found[1:]] == [each.shape for each in networks.parameters()]
+    (back,) = calls["draw_backward"]
+    assert (back.moves_steps, back.by_mean, back.by_drawn is None) == (False, None, False)
+    assert back.noise == calls["draw"][0].noise
+    bits = predicted.bits_of(drawn, forecast, 3)
+    assert (bits.shape, calls["bits"][0].last) == ((3, 22), 3)
+    torch.autograd.grad(bits, drawn, rand(3, 22))
+    (back,) = calls["bits_backward"]
+    assert (back.rows, back.last, back.to_values is None) == (7, 3, False)
+
+    opacities, covariances, dc, rest = drawable(values, rand(7), (-2.0, 1.0), AppearanceNetwork())
+    assert (opacities.shape, covariances.shape, dc.shape, rest.shape) == ((7,), (7, 6), (7, 1, 3), (7, 15, 3))
+    assert calls["splats"][0].covariances == covariances.data_ptr()
+    torch.autograd.grad(covariances, values, rand(7, 6))
+    (back,) = calls["splats_backward"]
+    assert (back.low, back.high, back.rows, back.by_opacities, back.by_colour) == (-2.0, 1.0, 7, None, None)
+
+
 def test_every_operation_is_named_here():
     text = Path(__file__).read_text("utf-8")
     for module in MODULES:

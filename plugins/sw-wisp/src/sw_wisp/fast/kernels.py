@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from splatwizard_native import fast_enabled
-from sw_wisp.fast import face
+from sw_wisp.fast import cuda_face, face
 from sw_wisp.fast.native import WISP
 
 
@@ -17,9 +17,9 @@ def fit_kernels(*tensors: Tensor) -> bool:
     first = tensors[0]
     if not fast_enabled() or any(t.dtype != torch.float32 or t.device != first.device for t in tensors):
         return False
-    return first.is_cpu and WISP.try_load()
+    return WISP.has_cuda() if first.is_cuda else first.is_cpu and WISP.try_load()
 
 
 def kernels_of(tensor: Tensor) -> ModuleType:
-    """Operations on the device of a tensor that fits."""
-    return face
+    """Return the operations on the device of a tensor that fits."""
+    return cuda_face if tensor.is_cuda else face

@@ -4,6 +4,18 @@ from __future__ import annotations
 
 from splatwizard_native import NativeModule
 
+WITHOUT = "wisp trains by torch operations: the same numbers, slower"
+
+WISP_CUDA = NativeModule(
+    name="sw_wisp_cuda",
+    package="sw_wisp",
+    face="kernels/cuda/face.h",
+    sources=("kernels/cuda/face.cpp",),
+    headers=("kernels/face.h", "kernels/calls.h", "kernels/kernels.h", "kernels/rows.h", "kernels/cuda/*.h"),
+    cuda_sources=("kernels/cuda/rows.cu",),
+    without=WITHOUT,
+)
+
 WISP = NativeModule(
     name="sw_wisp",
     package="sw_wisp",
@@ -12,5 +24,6 @@ WISP = NativeModule(
     kernels=("kernels/rows.cpp",),
     headers=("kernels/*.h",),
     cflags=("-fno-math-errno", "-fno-trapping-math"),  # without these GCC keeps sqrt and division out of vector code
-    without="wisp trains by torch operations: the same numbers, slower",
+    without=WITHOUT,
+    cuda=WISP_CUDA,
 )

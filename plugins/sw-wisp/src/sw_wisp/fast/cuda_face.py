@@ -1,0 +1,8 @@
+"""Operations of `kernels/cuda/face.h` on a GPU."""
+
+from __future__ import annotations
+
+from splatwizard_native import operations
+from sw_wisp.fast.native import WISP_CUDA as MODULE
+
+__getattr__ = operations(MODULE, __name__)
