@@ -66,7 +66,7 @@ def test_an_octree_is_estimated_within_a_few_per_cent():
     codes = np.sort(morton.encode(points))
     for bits in (10, 9, 7):
         real = len(Octree().encode(morton.decode(codes >> 3 * (10 - bits)), bits))
-        assert octree_bits(codes, 10)[bits] / 8 == pytest.approx(real, rel=0.06)
+        assert octree_bits(codes, 10)[bits] / 8 == pytest.approx(real, rel=0.08)  # counts of duplicates are coded apart
 
 
 def test_levels_stay_within_what_settings_allow(coder, model):

@@ -1,4 +1,4 @@
-"""What writes the file: `swz` by the octree and the quantised columns of `gaussians-quantized`.
+"""Writer of `.swz`: the octree and the quantised columns of `gaussians-quantized`, and sizes before it writes.
 
 A level is the step of an attribute in octaves of the step here; bits of the positions fall by one with each level.
 """
@@ -75,7 +75,7 @@ class Quantized:
         return {name: float(self.levels(name)[0]) for name in self.attributes(model)}
 
     def rounded(self, model: GaussianModel, levels: Levels) -> GaussianModel:
-        """What the file of these levels decodes to."""
+        """Return the Gaussians that a file of these levels decodes to."""
         layout, cells, symbols = quantized.lattice(model, self.settings(levels), morton.sort)
         return like(model, quantized.reconstruct(layout, cells, symbols).to(model.device))
 

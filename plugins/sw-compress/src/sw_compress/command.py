@@ -25,15 +25,17 @@ if TYPE_CHECKING:
 @click.command(short_help="any splat file to a size, without photographs")
 @click.argument("files", metavar="FILE...", nargs=-1, required=True, type=EXISTING)
 @options(
-    click.option("--size", metavar="SIZE", help="Bytes of the result at most: 8MB, 8MiB, 800kB or a number."),
-    click.option("--quality", metavar="DB", help="PSNR against the source's own pictures.  [default: 40dB]"),
-    click.option("--ratio", metavar="N", help="How many times smaller than the source."),
+    click.option("--size", metavar="SIZE",
+                 help="Bytes of the result at most: 8MB, 8MiB, 800kB or a number.  [default: as --quality says]"),
+    click.option("--quality", metavar="DB",
+                 help="PSNR against the source's own pictures.  [default: 40dB, without another target]"),
+    click.option("--ratio", metavar="N", help="How many times smaller than the source.  [default: as --quality says]"),
     click.option("--out", metavar="PATH", type=click.Path(),
                  help="The file to write; of several files a folder.  [default: beside the source]"),
     click.option("--format", "format_name", type=click.Choice(["swz", "sog", "spz"]), default="swz", show_default=True,
                  help="What is written: .swz is the smallest."),
     click.option("--cameras", type=EXISTING, metavar="FILE",
-                 help="JSON of cameras in place of those that are made up (README of sw-view)."),
+                 help="JSON of cameras (README of sw-view).  [default: they are made up]"),
     click.option("--views", type=click.IntRange(min=3), metavar="N",
                  help="Cameras that are made up, a third of them set aside.  [default: 18 to 120, by device and size]"),
     click.option("--gaussians", type=click.IntRange(min=1), metavar="N",
@@ -85,7 +87,7 @@ def compress(
 
 
 def _places(files: tuple[Path, ...], out: str | None, suffix: str, default: Any) -> list[Path]:
-    """Where each result goes. Raises UserInputError for a place that is a source, or that two share."""
+    """Return the place of each result. Raises UserInputError for a place that is a source, or that two share."""
     from splatwizard_core.api import UserInputError
     from splatwizard_core.tooling import OUTPUT_FILE, OUTPUT_FOLDER
 

@@ -142,7 +142,7 @@ def compress(
 
 @dataclass
 class _Work:
-    """What the making of a file is given."""
+    """Inputs of the making of a file."""
 
     source: Source
     model: GaussianModel

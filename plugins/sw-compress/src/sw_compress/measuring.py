@@ -1,4 +1,4 @@
-"""How strongly pictures depend on the precision of each attribute."""
+"""Measurement of how strongly pictures depend on the precision of each attribute."""
 
 from __future__ import annotations
 

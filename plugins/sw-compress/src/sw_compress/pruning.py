@@ -89,7 +89,7 @@ class Pruning:
         self._age = 0
 
     def _among_neighbours(self, order: Tensor) -> Tensor:
-        """How many of the same block of neighbours come before each of `order` [n] in it."""
+        """Count those of the same block of neighbours that come before each of `order` [n] in it."""
         means = self._model.means.detach()[self._left].double().cpu()
         low, high = means.amin(0), means.amax(0)
         cells = ((means - low) / (high - low).clamp_min(1e-30) * ((1 << 20) - 1)).long()

@@ -1,4 +1,4 @@
-"""How far pictures of a decoded scene are from those of its source, with the same cameras."""
+"""Distance of the pictures of a decoded scene from those of its source, with the same cameras."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def loss_against_photographs(psnr: float, photographs: float) -> float:
 
 
 def told_loss(psnr: float) -> str:
-    """What a PSNR against the source costs, in a sentence."""
+    """Tell in a sentence what a PSNR against the source costs."""
     losses = " / ".join(f"{loss_against_photographs(psnr, each):.2f}" for each in PHOTOGRAPHS)
     known = " / ".join(f"{each:g}" for each in PHOTOGRAPHS)
     return f"{psnr:.1f} dB to the source: {losses} dB of the photographs if the source meets them at {known} dB"

@@ -1,4 +1,4 @@
-"""How many Gaussians stay, and how precise they are: for a size, or for a quality. Nothing is coded here."""
+"""Choice of how many Gaussians stay and how precise they are: for a size, or a quality. Nothing is coded here."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ QUALITY_TRIES = 10
 
 @dataclass
 class Search:
-    """What is searched in.
+    """Scene, codec and measurements of a search.
 
     pictures    of the source at cameras to choose with
     count       how many Gaussians stay; None: what is best
@@ -58,7 +58,7 @@ class Search:
 
 @dataclass(frozen=True)
 class Choice:
-    """What to code.
+    """Gaussians to code, and their precision.
 
     model       the Gaussians that stay
     curves      of these
@@ -76,7 +76,7 @@ class Choice:
 
     @property
     def is_finest(self) -> bool:
-        """Whether nothing can be more precise."""
+        """True where nothing can be more precise."""
         return all(self.allocation.levels[curve.name] == curve.levels[0] for curve in self.curves)
 
     def resized(self, budget: float) -> Choice | None:
@@ -165,7 +165,7 @@ def _of_error(curves: Sequence[Curve], error: float) -> Allocation:
 
 
 def _measured(search: Search, choice: Choice, quality: float, held_out: Pictures) -> tuple[float, Choice | None]:
-    """What was reached last, dB, and the choice made finer or coarser until it is as good as asked for, little better.
+    """Return the dB reached last, and the choice made finer or coarser until it is as good as asked for, little better.
 
     None where its finest settings are not that good.
     """

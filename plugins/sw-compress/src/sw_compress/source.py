@@ -38,12 +38,12 @@ class Source:
 
     @property
     def antialiased(self) -> bool:
-        """Whether it was trained with the opacity compensation of the low-pass filter, and is to be drawn so."""
+        """True where it was trained with the opacity compensation of the low-pass filter, and is to be drawn so."""
         return antialias_of(self.model)
 
     @property
     def raster(self) -> dict[str, object]:
-        """What its file asks of a renderer, as the compressed one will."""
+        """Options that its file asks of a renderer, as the compressed one will."""
         eps2d = eps2d_of(self.model)
         asked = {"antialias": True} if self.antialiased else {}
         return {**asked, **({"eps2d": eps2d} if eps2d != RasterOptions().eps2d else {})}

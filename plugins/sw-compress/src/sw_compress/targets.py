@@ -1,4 +1,4 @@
-"""What a compressed file shall be: its size, its quality, or how much smaller."""
+"""Targets of a compressed file: its size, its quality, or how much smaller it is."""
 
 from __future__ import annotations
 

@@ -78,7 +78,7 @@ class MadeUpCameras:
 
 @dataclass(frozen=True)
 class Extent:
-    """Where the visible area of Gaussians lies: its weighted median, and the radii that hold 50, 80 and 95 %."""
+    """Place of the visible area of Gaussians: its weighted median, and the radii that hold 50, 80 and 95 %."""
 
     center: Array
     r50: float
