@@ -13,7 +13,7 @@ from sw_codecs.positions.octree import Octree
 
 @pytest.fixture(scope="module")
 def model(ball):
-    return ball(4000)
+    return ball(3000)
 
 
 @pytest.fixture(scope="module")

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-FINER = 8
-"""Levels that are told apart between two of a table."""
+FINER = 64
+"""Levels that are told apart between two of a table: a file in steps of less than half a per cent."""
 BISECTIONS = 60
 
 

@@ -26,7 +26,8 @@ from sw_compress.targets import LEAST_SHARE, Target
 from sw_compress.views import views_of
 
 SWZ = "swz"
-MOST_ENCODES = 4
+MOST_ENCODES = 6
+"""Two are usual; a small file is in jumps."""
 AIM = 0.997
 """Share of a target size that the second encode aims at."""
 
@@ -190,21 +191,24 @@ def _encoded(
     if size is None:
         return written, choice, 1
     encodes, best = 1, (written, choice) if written <= size else None
-    ratio = written / choice.bytes
+    budget = choice.bytes
     while encodes < MOST_ENCODES and not LEAST_SHARE * size < written <= size:
         if written <= size and choice.is_finest:
             say(f"the finest settings give {written:,} bytes, less than the target of {size:,}")
             break
-        found = choice.resized(AIM * size / ratio)
-        if found is None or found.allocation.levels == choice.allocation.levels:
+        budget *= AIM * size / written
+        found = choice.resized(budget)
+        if found is None:
             break
         choice = found
         written = coder.encode(choice.model, choice.allocation.levels, path)
-        ratio, encodes = written / choice.bytes, encodes + 1
+        encodes += 1
         if written <= size and (best is None or written > best[0]):
             best = written, choice
     if best is None:
         raise UserInputError(f"no file of {size:,} bytes was found: the smallest has {written:,} bytes")
+    if best[0] <= LEAST_SHARE * size and not best[1].is_finest:
+        say(f"{best[0]:,} bytes are the nearest to {size:,} that was found")
     if best[0] != written:
         written = coder.encode(best[1].model, best[1].allocation.levels, path)
         encodes += 1

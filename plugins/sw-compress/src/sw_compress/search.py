@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
+import torch
+
 from splatwizard_core.api import GaussianModel, UserInputError
 from sw_compress.allocation import Allocation, Curve, at_price, within
 from sw_compress.coders import FIXED_BYTES, POSITIONS, Quantized
@@ -93,13 +95,16 @@ class Choice:
 
 def for_size(search: Search, size: int) -> Choice:
     """The best picture in an estimated `size`. Raises UserInputError where nothing is so small."""
-    best, best_error, worse, smallest = None, math.inf, 0, math.inf
+    best, best_error, worse = None, math.inf, 0
+    smallest = _coarsest(search)
+    if smallest > 2 * size:  # no part that is worth more has half the bytes of one that is evenly taken
+        raise _too_small(size, smallest)
     for count in search.parts():
         part = search.part(count)
         curves = search.errors.curves(search.coder, part)
         found = within(curves, size - FIXED_BYTES)
         if found is None:
-            smallest = min(smallest, FIXED_BYTES + sum(float(curve.bytes[-1]) for curve in curves))
+            smallest = FIXED_BYTES + sum(float(curve.bytes[-1]) for curve in curves)
             if part.num_rows > 1.02 * count:  # the rest may not go
                 break
             continue
@@ -113,11 +118,22 @@ def for_size(search: Search, size: int) -> Choice:
         if worse == PATIENCE or part.num_rows > 1.02 * count:
             break
     if best is None:
-        raise UserInputError(
-            f"no file of {size:,} bytes holds this scene: the smallest that is possible has about "
-            f"{math.ceil(SPARE * smallest):,} bytes"
-        )
+        raise _too_small(size, smallest)
     return best
+
+
+def _coarsest(search: Search) -> float:
+    """Bytes of the fewest Gaussians as coarse as can be, evenly taken instead of the best."""
+    few = torch.arange(0, search.model.num_rows, max(1, search.model.num_rows // search.parts()[-1]))
+    part = select(search.model, few.to(search.model.device)[: search.parts()[-1]])
+    return FIXED_BYTES + sum(float(size[-1]) for size in search.coder.sizes(part).values())
+
+
+def _too_small(size: int, smallest: float) -> UserInputError:
+    return UserInputError(
+        f"no file of {size:,} bytes holds this scene: the smallest that is possible has about "
+        f"{math.ceil(SPARE * smallest):,} bytes"
+    )
 
 
 def for_quality(search: Search, quality: float, held_out: Pictures) -> Choice:
