@@ -11,8 +11,7 @@ from sw_compress import Compressed, compress, compressing
 from sw_compress.command import compress as command
 
 from splatwizard_core.api import UserInputError
-from splatwizard_core.tooling import export_model, load_plugins, open_model, read_gaussians
-from splatwizard_native.errors import DiskFullError
+from splatwizard_core.tooling import ForeseenError, export_model, load_plugins, open_model, read_gaussians
 
 pytestmark = pytest.mark.pipeline
 
@@ -97,7 +96,7 @@ def test_an_interruption_and_a_full_disk_leave_nothing(source, tmp_path, monkeyp
         raise stop
 
     monkeypatch.setattr(compressing, "_encoded", half_written)
-    with pytest.raises((KeyboardInterrupt, DiskFullError)):
+    with pytest.raises((KeyboardInterrupt, ForeseenError)):
         compress(source, size="5kB", views=6, device="cpu", out=out, drop_unseen=True)
     assert [path.name for path in tmp_path.iterdir()] == ["a.swz"]
     assert out.read_bytes() == b"an older file"

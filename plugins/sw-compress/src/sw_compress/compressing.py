@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,6 @@ import torch
 
 from splatwizard_core.api import GaussianModel, PluginManager, RasterOptions, UserInputError, replacing
 from splatwizard_core.tooling import NegotiatedRasterizer, choose_device, load_plugins, open_model
-from splatwizard_native import MemoryMeter, scratch_folder
 from sw_compress.coders import Quantized
 from sw_compress.formats import FORMATS, FormatFile, format_file
 from sw_compress.measuring import Errors
@@ -21,7 +21,7 @@ from sw_compress.quality import PHOTOGRAPHS, Pictures, loss_against_photographs,
 from sw_compress.rows import with_degree
 from sw_compress.search import Choice, Search, for_quality, for_size
 from sw_compress.source import Source, open_source
-from sw_compress.stages import Stages
+from sw_compress.stages import Stages, peak_bytes
 from sw_compress.targets import LEAST_SHARE, Target
 from sw_compress.views import views_of
 
@@ -88,8 +88,6 @@ def compress(
     if format not in (SWZ, *FORMATS):
         raise UserInputError(f"format '{format}' is none of {', '.join((SWZ, *FORMATS))}")
     chosen = choose_device(device, plugins)
-    meter = MemoryMeter(chosen)
-    meter.start()
     with stages.timed("read"):
         source = open_source(scene, plugins, chosen)
     target = Target.of(size, quality, ratio, source.file_bytes)
@@ -110,7 +108,8 @@ def compress(
             made, facts = make(work, temporary)
         path, data = Path(out), None
     else:
-        with scratch_folder("compress") as folder:
+        with tempfile.TemporaryDirectory(prefix="sw-compress-") as name:
+            folder = Path(name)
             made, facts = make(work, folder / f"scene.{format}")
             path, data = None, (folder / f"scene.{format}").read_bytes()
     with stages.timed("check"):
@@ -135,7 +134,7 @@ def compress(
         "told": told_loss(found.psnr),
         "cameras": seen.as_dict(),
         "seconds": stages.rounded(),
-        "peak_bytes": meter.peak_bytes(),
+        "peak_bytes": peak_bytes(chosen),
         "device": str(chosen),
     }
     return Compressed(path, data, made, record)
