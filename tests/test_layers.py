@@ -61,7 +61,8 @@ LIBRARIES = {
 EXTENDS = {"sw_hac_plus": "sw_hac"}
 """Method -> the method that it builds on, and so imports."""
 ABOUT_RUNS = {
-    "sw_bench", "sw_datasets", "sw_doctor", "sw_geometry", "sw_kit", "sw_metrics", "sw_report", "sw_view",
+    "sw_bench", "sw_compress", "sw_datasets", "sw_doctor", "sw_geometry", "sw_kit", "sw_metrics", "sw_report",
+    "sw_view",
 }  # fmt: skip
 """Packages that may use `tooling` besides `api`."""
 
@@ -155,6 +156,8 @@ SHELVES = {"sw_rasterizers", "sw_codecs", "sw_gaussians", "sw_anchors", "sw_refe
 FOR_ONE = {
     "sw_gaussians.baking": "makes explicit Gaussians of a model for sw-view, and knows the parts of GaussianModel",
     "sw_gaussians.bake_refining": "trains on pictures that sw-view gives it, with the stage of sw-gaussians",
+    "sw_gaussians.made_up_cameras": "cameras for Gaussians that came without any, beside those of files and paths",
+    "sw_gaussians.ring_cameras": "two closed rules of the same, by which the MPEG protocol draws",
 }
 """Module of a library that one family alone reaches -> why it is there; at most ten."""
 

@@ -72,6 +72,7 @@ from splatwizard_core.runs.device import choose_device as choose_device
 from splatwizard_core.runs.directory import OWN_FILES as OWN_FILES
 from splatwizard_core.runs.directory import RunRequest as RunRequest
 from splatwizard_core.runs.directory import run_directory as run_directory
+from splatwizard_core.runs.encode import encode as encode
 from splatwizard_core.runs.identity import recorded_hash as recorded_hash
 from splatwizard_core.runs.measure import open_subject as open_subject
 from splatwizard_core.runs.observers import FinishedRun as FinishedRun

@@ -1,0 +1,165 @@
+"""Writer of `.swz`: the octree and the quantised columns of `gaussians-quantized`, and sizes before it writes.
+
+A level is the step of an attribute in octaves of the step here; bits of the positions fall by one with each level.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from splatwizard_core.api import GaussianModel, create_method
+from splatwizard_core.tooling import encode as encode_model
+from sw_codecs.models import quantized
+from sw_codecs.models.band_context import activity_classes
+from sw_codecs.models.position_grid import PositionGrid
+from sw_codecs.models.settings import QuantizedSettings
+from sw_codecs.positions import morton
+from sw_compress.rows import like, select
+
+if TYPE_CHECKING:
+    from splatwizard_core.api import PluginManager
+
+Levels = Mapping[str, float]
+
+POSITIONS = "positions"
+STEPS = {"opacity": 0.25, "scale": 0.1, "quat": 0.022, "dc": 0.07, "rest": 0.055}
+"""Quantiser steps at level 0, as of rate point r3 of 3dgs."""
+POSITION_BITS = 15
+"""Bits per axis at level 0."""
+FINEST, COARSEST = -4.0, 5.0
+LEVELS = np.arange(FINEST, COARSEST + 0.25, 0.5)
+POSITION_LEVELS = np.arange(POSITION_BITS - 20, POSITION_BITS - 7, dtype=np.float64)
+LARGEST_QUAT_STEP = 0.5
+SAMPLE = 1 << 17
+"""Gaussians that tables are made from."""
+TABLE_BITS = 3.0
+"""Of each distinct value of a column, for its stored count."""
+FIXED_BYTES = 1100
+"""Of the header and of what stands before each section."""
+
+
+@dataclass(frozen=True)
+class Quantized:
+    """Writes `.swz` files of the method `3dgs`.
+
+    raster      what the file asks of a renderer
+    """
+
+    plugins: PluginManager
+    raster: Mapping[str, Any]
+
+    def attributes(self, model: GaussianModel) -> tuple[str, ...]:
+        """Names of what has a level."""
+        return (POSITIONS, *(name for name in STEPS if name != "rest" or model.active_sh_degree))
+
+    def levels(self, name: str) -> NDArray[np.float64]:
+        """Levels that an attribute may have."""
+        if name == POSITIONS:
+            return POSITION_LEVELS
+        return LEVELS[STEPS[name] * 2.0**LEVELS <= LARGEST_QUAT_STEP] if name == "quat" else LEVELS
+
+    def settings(self, levels: Levels) -> QuantizedSettings:
+        """Settings of the codec."""
+        steps = {f"{name}_step": STEPS[name] * 2.0 ** levels.get(name, 0.0) for name in STEPS}
+        return QuantizedSettings(position_bits=int(POSITION_BITS - levels[POSITIONS]), **steps)
+
+    def finest(self, model: GaussianModel) -> dict[str, float]:
+        """Levels at which nothing is lost that could be seen."""
+        return {name: float(self.levels(name)[0]) for name in self.attributes(model)}
+
+    def rounded(self, model: GaussianModel, levels: Levels) -> GaussianModel:
+        """Return the Gaussians that a file of these levels decodes to."""
+        layout, cells, symbols = quantized.lattice(model, self.settings(levels), morton.sort)
+        return like(model, quantized.reconstruct(layout, cells, symbols).to(model.device))
+
+    def sizes(self, model: GaussianModel) -> dict[str, NDArray[np.float64]]:
+        """Bytes of each attribute at each of its levels, from entropies; nothing is coded."""
+        count = model.num_rows
+        part = model
+        if count > SAMPLE:
+            chosen = torch.randperm(count, generator=torch.Generator().manual_seed(0))[:SAMPLE].sort().values
+            part = select(model, chosen.to(model.device))
+        names = [name for name in self.attributes(model) if name != POSITIONS]
+        found: dict[str, list[float]] = {name: [] for name in names}
+        for level in LEVELS:
+            levels = {POSITIONS: 0.0, **{name: min(level, float(self.levels(name)[-1])) for name in names}}
+            layout, _, symbols = quantized.lattice(part, self.settings(levels), morton.sort)
+            for name, bits in _bits(layout, symbols).items():
+                if name in found and level <= self.levels(name)[-1]:
+                    found[name].append(bits * count / max(len(symbols), 1) / 8)
+        return {POSITIONS: self._position_sizes(model), **{name: np.array(each) for name, each in found.items()}}
+
+    def _position_sizes(self, model: GaussianModel) -> NDArray[np.float64]:
+        finest = self.settings({**self.finest(model), POSITIONS: float(POSITION_LEVELS[0])})
+        grid = PositionGrid.fit(model.means.detach().cpu().numpy(), finest.position_bits)
+        codes = np.sort(morton.encode(grid.quantize(model.means.detach().cpu().numpy())))
+        bits = octree_bits(codes, finest.position_bits)
+        return np.array([bits[int(POSITION_BITS - level)] / 8 for level in POSITION_LEVELS])
+
+    def encode(self, model: GaussianModel, levels: Levels, path: Path) -> int:
+        """Write the file; return its bytes."""
+        settings = self.settings(levels).model_dump()
+        values = {f"codec.settings.{key}": value for key, value in settings.items() if not isinstance(value, str)}
+        method = create_method(self.plugins, "3dgs", {"codec.name": "gaussians-quantized", **values})
+        origin = model.world_origin or (0.0, 0.0, 0.0)
+        return encode_model(method, model, dict(self.raster), path, origin).bytes
+
+
+def _bits(layout: quantized.Layout, symbols: NDArray[np.int32]) -> dict[str, float]:
+    """Bits of the columns of each attribute."""
+    names = {"color": "dc", "opacity": "opacity", "scales": "scale", "quats": "quat"}
+    found = {names[key]: columns_bits(symbols[:, a:b]) for key, (a, b) in layout.sections.items()}
+    rest = 0.0
+    for band in range(1, layout.active_sh_degree + 1):
+        a, b = (layout.base_columns + 3 * (k**2 - 1) for k in (band, band + 1))
+        if band == 1:
+            rest += columns_bits(symbols[:, a:b])
+            continue
+        classes = activity_classes(symbols[:, layout.base_columns : a], layout.sh_classes)
+        rest += sum(columns_bits(symbols[classes == k, a:b]) for k in range(layout.sh_classes))
+    return {**found, "rest": rest}
+
+
+def columns_bits(symbols: NDArray[np.int32]) -> float:
+    """Bits of integer columns [n,c], each by its own counts, which are stored."""
+    total = 0.0
+    for column in symbols.T:
+        if not len(column):
+            continue
+        low, high = int(column.min()), int(column.max())
+        if low == high:
+            continue
+        shift = max((high - low).bit_length() - 12, 0)  # low bits that go raw where values are many
+        counts = np.bincount((column - low) >> shift)
+        counts = counts[counts > 0]
+        total += float((counts * np.log2(len(column) / counts)).sum()) + shift * len(column)
+        total += TABLE_BITS * len(counts)
+    return total
+
+
+def octree_bits(codes: NDArray[np.int64], bits: int) -> list[float]:
+    """Bits of an octree over sorted Morton codes [n] of `bits` bits an axis, cut at each depth 0 .. `bits`."""
+    total, found = 0.0, [0.0]
+    parents = np.ones(1, np.int64)  # children of each node's parent
+    nodes = np.zeros(1, np.int64)
+    for depth in range(1, bits + 1):
+        path = codes >> (3 * (bits - depth))
+        children = path[np.diff(path, prepend=-1) != 0]
+        parent = np.searchsorted(nodes, children >> 3)
+        occupancy = np.bincount(parent, 1 << (children & 7), minlength=len(nodes)).astype(np.int64)
+        for context in range(1, 5):
+            counts = np.bincount(occupancy[np.minimum(parents, 4) == context])
+            counts = counts[counts > 0]
+            total += float((counts * np.log2(counts.sum() / counts)).sum()) + TABLE_BITS * len(counts)
+        number = np.bincount(parent, minlength=len(nodes))
+        nodes, parents = children, number[parent]
+        several = np.diff(np.append(np.flatnonzero(np.diff(path, prepend=-1) != 0), len(path)))
+        found.append(total + (columns_bits(several[:, None].astype(np.int32)) if len(nodes) < len(path) else 0.0))
+    return found

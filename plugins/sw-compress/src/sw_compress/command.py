@@ -1,0 +1,121 @@
+"""`sw compress`: any splat file to a size or a quality, without its photographs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from splatwizard_core.tooling import (
+    EXISTING,
+    ForeseenError,
+    debug_option,
+    device_option,
+    json_option,
+    options,
+    print_facts,
+    say,
+)
+
+if TYPE_CHECKING:
+    from sw_compress.compressing import Compressed
+
+
+@click.command(short_help="any splat file to a size, without photographs")
+@click.argument("files", metavar="FILE...", nargs=-1, required=True, type=EXISTING)
+@options(
+    click.option("--size", metavar="SIZE",
+                 help="Bytes of the result at most: 8MB, 8MiB, 800kB or a number.  [default: as --quality says]"),
+    click.option("--quality", metavar="DB",
+                 help="PSNR against the source's own pictures.  [default: 40dB, without another target]"),
+    click.option("--ratio", metavar="N", help="How many times smaller than the source.  [default: as --quality says]"),
+    click.option("--out", metavar="PATH", type=click.Path(),
+                 help="The file to write; of several files a folder.  [default: beside the source]"),
+    click.option("--format", "format_name", type=click.Choice(["swz", "sog", "spz"]), default="swz", show_default=True,
+                 help="What is written: .swz is the smallest."),
+    click.option("--cameras", type=EXISTING, metavar="FILE",
+                 help="JSON of cameras (README of sw-view).  [default: they are made up]"),
+    click.option("--views", type=click.IntRange(min=3), metavar="N",
+                 help="Cameras that are made up, a third of them set aside.  [default: 18 to 120, by device and size]"),
+    click.option("--gaussians", type=click.IntRange(min=1), metavar="N",
+                 help="Gaussians that stay.  [default: what gives the best picture]"),
+    click.option("--sh-degree", type=click.IntRange(0, 3), metavar="D",
+                 help="Highest degree of the spherical harmonics.  [default: the source's]"),
+    click.option("--drop-unseen", is_flag=True, help="Let go what no camera shows."),
+    device_option, json_option, debug_option,
+)  # fmt: skip
+def compress(
+    files: tuple[Path, ...], size: str | None, quality: str | None, ratio: str | None, out: str | None,
+    format_name: str, cameras: Path | None, views: int | None, gaussians: int | None, sh_degree: int | None,
+    drop_unseen: bool, device: str | None, as_json: bool,
+) -> None:  # fmt: skip
+    """Make FILE small without its photographs: fewer Gaussians, each as precise as its part in the picture asks for.
+
+    FILE is any splat file: .ply, .spz, .splat, .sog, .ksplat, .glb, or a .swz. With --size the result has 99 to 100 %
+    of it, never more. Cameras are made up from the scene, and a third of them only measures: the PSNR is against
+    pictures of the source, and a line says what it would cost against photographs.
+
+    Of several files each is made to the same target; those that fail do not stop the others.
+    """
+    from sw_compress.compressing import compress as make
+    from sw_compress.source import default_output
+
+    places = _places(files, out, f".{format_name}", default_output)
+    records: list[dict[str, Any]] = []
+    failed: list[ForeseenError] = []
+    for file, place in zip(files, places, strict=True):
+        try:
+            done = make(
+                file, size=size, quality=quality, ratio=ratio, out=place, format=format_name, cameras=cameras,
+                views=views, gaussians=gaussians, sh_degree=sh_degree, drop_unseen=drop_unseen,
+                device=device or "auto", say=say,
+            )  # fmt: skip
+        except ForeseenError as error:
+            if len(files) == 1:
+                raise
+            say(f"{file}: {error}")
+            failed.append(error)
+            continue
+        records.append(done.record)
+        if not as_json:
+            click.echo(_told(done))
+    if as_json:
+        print_facts(records[0] if len(files) == 1 else {"files": records}, True, "")
+    if failed:
+        raise click.ClickException(f"{len(failed)} of {len(files)} files failed")
+
+
+def _places(files: tuple[Path, ...], out: str | None, suffix: str, default: Any) -> list[Path]:
+    """Return the place of each result. Raises UserInputError for a place that is a source, or that two share."""
+    from splatwizard_core.api import UserInputError
+    from splatwizard_core.tooling import OUTPUT_FILE, OUTPUT_FOLDER
+
+    if len(files) == 1:
+        places = [OUTPUT_FILE.check(out if out is not None else default(files[0], suffix))]
+    elif out is None:
+        places = [OUTPUT_FILE.check(default(file, suffix)) for file in files]
+    else:
+        folder = OUTPUT_FOLDER.check(out)
+        folder.mkdir(parents=True, exist_ok=True)
+        places = [folder / f"{file.stem}{suffix}" for file in files]
+    sources = {file.resolve() for file in files}
+    for place in places:
+        if place.resolve() in sources:
+            raise UserInputError(f"{place} is a source, and would be replaced: give another --out")
+        if places.count(place) > 1:
+            raise UserInputError(
+                f"two results would be {place}: compress them one by one, or into folders of their own"
+            )
+    return places
+
+
+def _told(done: Compressed) -> str:
+    record = done.record
+    source = record["source"]
+    times = f"{source['bytes'] / record['bytes']:.1f} x smaller than {source['file']}, "
+    counts = f"{record['gaussians']:,} of {source['gaussians']:,} Gaussians"
+    return (
+        f"{done.out}: {record['bytes']:,} bytes, {times}{counts}, in {record['seconds']['total']:.1f} s\n"
+        f"  {record['told']}"
+    )

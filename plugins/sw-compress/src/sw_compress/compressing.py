@@ -1,0 +1,231 @@
+"""A splat file made small: cameras, what may go, how precise the rest is, and the file."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from splatwizard_core.api import GaussianModel, PluginManager, RasterOptions, UserInputError, replacing
+from splatwizard_core.tooling import NegotiatedRasterizer, choose_device, load_plugins, open_model
+from sw_compress.coders import Quantized
+from sw_compress.formats import FORMATS, FormatFile, format_file
+from sw_compress.measuring import Errors
+from sw_compress.pruning import Pruning
+from sw_compress.quality import PHOTOGRAPHS, Pictures, loss_against_photographs, told_loss
+from sw_compress.rows import with_degree
+from sw_compress.search import Choice, Search, for_quality, for_size
+from sw_compress.source import Source, open_source
+from sw_compress.stages import Stages, peak_bytes
+from sw_compress.targets import LEAST_SHARE, Target
+from sw_compress.views import views_of
+
+SWZ = "swz"
+MOST_ENCODES = 6
+"""Two are usual; a small file is in jumps."""
+AIM = 0.997
+"""Share of a target size that the second encode aims at."""
+
+
+@dataclass(frozen=True)
+class Compressed:
+    """Outcome.
+
+    out     the file; None where its bytes were asked for
+    data    the bytes; None where a file was asked for
+    model   as the file decodes
+    record  bytes by section, counts, precision, quality, cameras, seconds: JSON values
+    """
+
+    out: Path | None
+    data: bytes | None
+    model: GaussianModel
+    record: dict[str, Any]
+
+
+def compress(
+    scene: str | os.PathLike[str] | GaussianModel,
+    *,
+    size: str | int | None = None,
+    quality: str | float | None = None,
+    ratio: str | float | None = None,
+    out: str | os.PathLike[str] | None = None,
+    format: str = SWZ,
+    cameras: str | os.PathLike[str] | None = None,
+    views: int | None = None,
+    gaussians: int | None = None,
+    sh_degree: int | None = None,
+    drop_unseen: bool = False,
+    device: str = "auto",
+    plugins: PluginManager | None = None,
+    say: Callable[[str], None] = lambda line: None,
+) -> Compressed:
+    """Make a scene small without its photographs.
+
+    scene       a file of explicit Gaussians of any known format, or a model
+    size        bytes of the result at most: 8_000_000 or "8MB"; it has more than 99 % of them
+    quality     dB against the source's own pictures at cameras that were held out; 40 where nothing is asked for
+    ratio       of the source file's bytes to those of the result
+    out         path of the result; None: its bytes are returned
+    format      "swz", "sog" or "spz"
+    cameras     JSON of cameras in place of those made up
+    views       number of cameras that are made up; None: 18 to 60 on a CPU, 48 to 120 on a GPU, more where there is
+                less to draw
+    gaussians   number that stays; None: what gives the best picture
+    sh_degree   highest degree of the spherical harmonics; None: the source's
+    drop_unseen whether what no camera shows may go
+    say         takes lines for the user
+
+    Equal files, options and kind of device give equal bytes. Raises UserInputError for a target out of reach,
+    SceneError and BitstreamError for a source that cannot be used.
+    """
+    stages, plugins = Stages(), load_plugins() if plugins is None else plugins
+    if format not in (SWZ, *FORMATS):
+        raise UserInputError(f"format '{format}' is none of {', '.join((SWZ, *FORMATS))}")
+    chosen = choose_device(device, plugins)
+    with stages.timed("read"):
+        source = open_source(scene, plugins, chosen)
+    target = Target.of(size, quality, ratio, source.file_bytes)
+    if gaussians is not None and gaussians < 1:
+        raise UserInputError(f"{gaussians} Gaussians: at least 1 must stay")
+    model = source.model if sh_degree is None else with_degree(source.model, sh_degree)
+    rasterizer = NegotiatedRasterizer(plugins, device=chosen, options=source.raster)
+    with stages.timed("cameras"), torch.no_grad():
+        seen = views_of(source.model, rasterizer, None if cameras is None else Path(cameras), views)
+        options = RasterOptions(alpha=True)
+        judge = Pictures(source.model, seen.judge, rasterizer, options)
+        held_out = Pictures(source.model, seen.held_out, rasterizer, options)
+    pruning = Pruning(model, seen.fit, rasterizer, keeps_unseen=not (drop_unseen or cameras))
+    work = _Work(source, model, judge, held_out, pruning, target, gaussians, stages, plugins, say)
+    make = _make_swz if format == SWZ else _make_other(format)
+    if out is not None:
+        with replacing(out) as temporary:
+            made, facts = make(work, temporary)
+        path, data = Path(out), None
+    else:
+        with tempfile.TemporaryDirectory(prefix="sw-compress-") as name:
+            folder = Path(name)
+            made, facts = make(work, folder / f"scene.{format}")
+            path, data = None, (folder / f"scene.{format}").read_bytes()
+    with stages.timed("check"):
+        found = held_out.quality(made)
+    record = {
+        "file": None if path is None else str(path),
+        "format": format,
+        "source": {"file": source.name, "bytes": source.file_bytes, "gaussians": source.read},
+        "target": {"bytes": target.size, "psnr": target.quality},
+        **facts,
+        "gaussians": made.num_rows,
+        "left_out": source.read - source.model.num_rows,
+        "pruned": source.model.num_rows - made.num_rows,
+        "merged": 0,
+        "unseen": pruning.unseen,
+        "sh_degree": made.active_sh_degree,
+        "antialiased": source.antialiased,
+        "quality": found.as_dict(),
+        "loss_of_photographs": {
+            f"{each:g}": round(loss_against_photographs(found.psnr, each), 3) for each in PHOTOGRAPHS
+        },
+        "told": told_loss(found.psnr),
+        "cameras": seen.as_dict(),
+        "seconds": stages.rounded(),
+        "peak_bytes": peak_bytes(chosen),
+        "device": str(chosen),
+    }
+    return Compressed(path, data, made, record)
+
+
+@dataclass
+class _Work:
+    """Inputs of the making of a file."""
+
+    source: Source
+    model: GaussianModel
+    judge: Pictures
+    held_out: Pictures
+    pruning: Pruning
+    target: Target
+    gaussians: int | None
+    stages: Stages
+    plugins: PluginManager
+    say: Callable[[str], None]
+
+
+def _make_swz(work: _Work, path: Path) -> tuple[GaussianModel, dict[str, Any]]:
+    coder = Quantized(work.plugins, work.source.raster)
+    with work.stages.timed("sensitivities"):
+        errors = Errors(coder, work.model, work.judge)
+    search = Search(coder, work.model, work.pruning, work.judge, errors, work.gaussians)
+    with work.stages.timed("search"):
+        if work.target.size is not None:
+            choice = for_size(search, work.target.size)
+        else:
+            assert work.target.quality is not None  # one of the two is given
+            choice = for_quality(search, work.target.quality, work.held_out)
+    with work.stages.timed("encode"):
+        size, choice, encodes = _encoded(coder, choice, work.target.size, path, work.say)
+    with work.stages.timed("decode"):
+        model, reader = open_model(path, work.plugins, work.model.device)
+    assert isinstance(model, GaussianModel)  # of a method of explicit Gaussians
+    facts = {
+        "bytes": size,
+        "sections": {"header": reader.header_bytes, **reader.sections},
+        "precision": coder.settings(choice.allocation.levels).model_dump(exclude={"positions", "entropy"}),
+        "encodes": encodes,
+        "tried": [{"gaussians": n, "bytes": round(b), "psnr": round(q, 2)} for n, b, q in search.tried],
+    }
+    return model, facts
+
+
+def _encoded(
+    coder: Quantized, choice: Choice, size: int | None, path: Path, say: Callable[[str], None]
+) -> tuple[int, Choice, int]:
+    """Bytes of the file that was written, what it holds, and how often it was written."""
+    written = coder.encode(choice.model, choice.allocation.levels, path)
+    if size is None:
+        return written, choice, 1
+    encodes, best = 1, (written, choice) if written <= size else None
+    budget = choice.bytes
+    while encodes < MOST_ENCODES and not LEAST_SHARE * size < written <= size:
+        if written <= size and choice.is_finest:
+            say(f"the finest settings give {written:,} bytes, less than the target of {size:,}")
+            break
+        budget *= AIM * size / written
+        found = choice.resized(budget)
+        if found is None:
+            break
+        choice = found
+        written = coder.encode(choice.model, choice.allocation.levels, path)
+        encodes += 1
+        if written <= size and (best is None or written > best[0]):
+            best = written, choice
+    if best is None:
+        raise UserInputError(f"no file of {size:,} bytes was found: the smallest has {written:,} bytes")
+    if best[0] <= LEAST_SHARE * size and not best[1].is_finest:
+        say(f"{best[0]:,} bytes are the nearest to {size:,} that was found")
+    if best[0] != written:
+        written = coder.encode(best[1].model, best[1].allocation.levels, path)
+        encodes += 1
+    return written, best[1], encodes
+
+
+def _make_other(name: str) -> Callable[[_Work, Path], tuple[GaussianModel, dict[str, Any]]]:
+    def make(work: _Work, path: Path) -> tuple[GaussianModel, dict[str, Any]]:
+        with work.stages.timed("search"):
+            found: FormatFile = format_file(
+                name, work.model, work.pruning, work.judge, work.held_out, work.target, work.gaussians, work.plugins,
+                antialiased=work.source.antialiased, say=work.say,
+            )  # fmt: skip
+        path.write_bytes(found.data)
+        facts = {
+            "bytes": len(found.data), "sections": found.sections, "precision": found.settings,
+            "encodes": found.encodes, "tried": found.tried,
+        }  # fmt: skip
+        return found.model, facts
+
+    return make

@@ -1,0 +1,110 @@
+"""The order in which Gaussians may go: each time those whose removal changes the pictures least.
+
+Removals in one place add coherently, since what they take away is always light: so few go at once, few of them
+neighbours, and what is left is judged anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from sw_gaussians.morton import interleave
+from sw_gaussians.removal import removal_costs
+from torch import Tensor
+
+from splatwizard_core.api import Camera, GaussianModel, track
+from sw_compress.rows import select
+
+if TYPE_CHECKING:
+    from splatwizard_core.api import Rasterizer
+    from splatwizard_core.tooling import Bar
+
+ROUND_SHARE = 0.15
+"""Largest share of the Gaussians that goes in one round."""
+NEIGHBOURS, AT_ONCE = 16, 4
+"""Of so many neighbours in Morton order, so many go at most in one round."""
+ROUNDS_PER_SCORE = 2
+SEEN = 1 / 255
+"""Largest weight in any pixel below which a Gaussian counts as not seen."""
+
+
+class Pruning:
+    """Removals in order, made as far as they are asked for: what `rows` returns for fewer is a part of that for more.
+
+    cameras         that judge
+    keeps_unseen    whether Gaussians that none of them shows stay: cameras that were made up prove nothing
+    """
+
+    def __init__(
+        self, model: GaussianModel, cameras: Sequence[Camera], rasterizer: Rasterizer, *, keeps_unseen: bool = True
+    ) -> None:
+        self._model, self._cameras, self._rasterizer = model, list(cameras), rasterizer
+        self._keeps_unseen = keeps_unseen
+        self._left = torch.arange(model.num_rows, device=model.device)
+        self._gone: list[Tensor] = []
+        self._costs, self._age = torch.zeros(0), ROUNDS_PER_SCORE
+        self.unseen = 0
+
+    def rows(self, count: int) -> Tensor:
+        """Rows [M] int64, ascending, that are left where `count` shall be; more where the others may not go."""
+        while len(self._left) > count and self._round(len(self._left) - count):
+            pass
+        removed = self._model.num_rows - count
+        gone = torch.cat([*self._gone, self._left[:0]])[: max(removed, 0)]
+        kept = torch.ones(self._model.num_rows, dtype=torch.bool, device=self._model.device)
+        kept[gone] = False
+        return kept.nonzero().squeeze(1)
+
+    def _round(self, wanted: int) -> bool:
+        """Remove some, `wanted` at most; False where none may go."""
+        if self._age == ROUNDS_PER_SCORE:
+            self._score()
+        self._age += 1
+        allowed = min(wanted, max(1, int(ROUND_SHARE * len(self._left))))
+        order = torch.sort(self._costs, stable=True).indices
+        order = order[self._among_neighbours(order) < AT_ONCE]
+        order = order[self._costs[order].isfinite()][:allowed]
+        if not len(order):
+            return False
+        self._gone.append(self._left[order])
+        stays = torch.ones(len(self._left), dtype=torch.bool, device=self._left.device)
+        stays[order] = False
+        self._left, self._costs = self._left[stays], self._costs[stays]
+        return True
+
+    def _score(self) -> None:
+        """Judge what is left; infinite for what may not go."""
+        part = select(self._model, self._left)
+        with track(f"judge {len(self._left):,} Gaussians", total=len(self._cameras), unit="views") as bar:
+            costs = removal_costs(
+                lambda camera: part.gaussians(camera.to(part.device), self._rasterizer),
+                _counted(self._cameras, bar), self._rasterizer, also=("blend_max",),
+            )  # fmt: skip
+        unseen = costs.scores["blend_max"] < SEEN
+        if not self._gone:
+            self.unseen = int(unseen.sum())
+        self._costs = torch.where(unseen & self._keeps_unseen, torch.inf, costs.change)
+        self._age = 0
+
+    def _among_neighbours(self, order: Tensor) -> Tensor:
+        """Count those of the same block of neighbours that come before each of `order` [n] in it."""
+        means = self._model.means.detach()[self._left].double().cpu()
+        low, high = means.amin(0), means.amax(0)
+        cells = ((means - low) / (high - low).clamp_min(1e-30) * ((1 << 20) - 1)).long()
+        morton = torch.from_numpy(interleave(cells.numpy())).argsort(stable=True)
+        block = torch.empty_like(morton)
+        block[morton] = torch.arange(len(morton)) // NEIGHBOURS
+        blocks = block.to(order.device)[order]
+        by_block = torch.sort(blocks, stable=True)
+        first = torch.searchsorted(by_block.values, by_block.values)
+        place = torch.empty_like(order)
+        place[by_block.indices] = torch.arange(len(order), device=order.device) - first
+        return place
+
+
+def _counted(cameras: list[Camera], bar: Bar) -> Iterator[Camera]:
+    for camera in cameras:
+        yield camera
+        bar.advance()

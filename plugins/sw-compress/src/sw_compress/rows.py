@@ -1,0 +1,32 @@
+"""Parts of a model of Gaussians."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from splatwizard_core.api import GaussianModel
+
+
+@torch.no_grad()
+def select(model: GaussianModel, rows: Tensor) -> GaussianModel:
+    """The Gaussians of an index [M] or mask [N], in that order."""
+    raw = {name: getattr(model, name).detach()[rows].contiguous() for name in model.RAW}
+    return like(model, type(model)(**raw, active_sh_degree=model.active_sh_degree))
+
+
+@torch.no_grad()
+def with_degree(model: GaussianModel, degree: int) -> GaussianModel:
+    """The same without the SH bands above a degree."""
+    if degree >= model.active_sh_degree == model.max_sh_degree:
+        return model
+    degree = min(degree, model.active_sh_degree)
+    raw = {name: getattr(model, name).detach() for name in model.RAW}
+    raw["sh_rest"] = raw["sh_rest"][:, : (degree + 1) ** 2 - 1].contiguous()
+    return like(model, type(model)(**raw))
+
+
+def like(model: GaussianModel, other: GaussianModel) -> GaussianModel:
+    """`other`, fixed, with the facts that the file of `model` told."""
+    other.origin = model.origin
+    return other.eval().requires_grad_(False)

@@ -1,0 +1,210 @@
+"""Choice of how many Gaussians stay and how precise they are: for a size, or a quality. Nothing is coded here."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import torch
+
+from splatwizard_core.api import GaussianModel, UserInputError
+from sw_compress.allocation import Allocation, Curve, at_price, within
+from sw_compress.coders import FIXED_BYTES, POSITIONS, Quantized
+from sw_compress.measuring import Errors
+from sw_compress.quality import Pictures, decibels
+from sw_compress.rows import select
+from sw_compress.targets import QUALITY_MARGIN
+
+if TYPE_CHECKING:
+    from sw_compress.pruning import Pruning
+
+SHARES = (1.0, 0.8, 0.64, 0.5, 0.4, 0.3, 0.2, 0.14, 0.1, 0.05, 0.02)
+"""Shares of the Gaussians that are tried, until it gets worse."""
+PATIENCE = 2
+"""Shares that may be worse than the best before the rest is left out."""
+SPARE = 1.03
+"""Head-room of an estimate that is told as a size."""
+QUALITY_TRIES = 10
+
+
+@dataclass
+class Search:
+    """Scene, codec and measurements of a search.
+
+    pictures    of the source at cameras to choose with
+    count       how many Gaussians stay; None: what is best
+    tried       (gaussians, bytes estimated, dB against the source) of each that was drawn
+    """
+
+    coder: Quantized
+    model: GaussianModel
+    pruning: Pruning
+    pictures: Pictures
+    errors: Errors
+    count: int | None = None
+    tried: list[tuple[int, float, float]] = field(default_factory=list)
+
+    def parts(self) -> list[int]:
+        """Numbers of Gaussians to try, falling."""
+        whole = self.model.num_rows
+        if self.count is not None:
+            return [min(self.count, whole)]
+        return sorted({max(1, round(share * whole)) for share in SHARES}, reverse=True)
+
+    def part(self, count: int) -> GaussianModel:
+        """The model with as many Gaussians as `count`, or as few as may stay."""
+        return self.model if count == self.model.num_rows else select(self.model, self.pruning.rows(count))
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Gaussians to code, and their precision.
+
+    model       the Gaussians that stay
+    curves      of these
+    allocation  levels, and what the tables say of them; bytes without the file's fixed ones
+    """
+
+    model: GaussianModel
+    curves: list[Curve]
+    allocation: Allocation
+
+    @property
+    def bytes(self) -> float:
+        """Estimate of the file."""
+        return self.allocation.bytes + FIXED_BYTES
+
+    @property
+    def is_finest(self) -> bool:
+        """True where nothing can be more precise."""
+        return all(self.allocation.levels[curve.name] == curve.levels[0] for curve in self.curves)
+
+    def resized(self, budget: float) -> Choice | None:
+        """The same Gaussians, places as precise as here, in a file of `budget` bytes by the estimate."""
+        fixed = [self._fixed(curve) if curve.name == POSITIONS else curve for curve in self.curves]
+        found = within(fixed, budget - FIXED_BYTES)
+        return None if found is None else replace(self, allocation=found)
+
+    def _fixed(self, curve: Curve) -> Curve:
+        k = int(abs(curve.levels - self.allocation.levels[POSITIONS]).argmin())
+        part = slice(k, k + 1)
+        return Curve(curve.name, curve.levels[part], curve.bytes[part], curve.error[part], True)
+
+
+def for_size(search: Search, size: int) -> Choice:
+    """The best picture in an estimated `size`. Raises UserInputError where nothing is so small."""
+    best, best_error, worse = None, math.inf, 0
+    smallest = _coarsest(search)
+    if smallest > 2 * size:  # no part that is worth more has half the bytes of one that is evenly taken
+        raise _too_small(size, smallest)
+    for count in search.parts():
+        part = search.part(count)
+        curves = search.errors.curves(search.coder, part)
+        found = within(curves, size - FIXED_BYTES)
+        if found is None:
+            smallest = FIXED_BYTES + sum(float(curve.bytes[-1]) for curve in curves)
+            if part.num_rows > 1.02 * count:  # the rest may not go
+                break
+            continue
+        error = search.pictures.error(search.coder.rounded(part, found.levels))
+        choice = Choice(part, curves, found)
+        search.tried.append((part.num_rows, choice.bytes, decibels(error)))
+        if error < best_error:
+            best, best_error, worse = choice, error, 0
+        else:
+            worse += 1
+        if worse == PATIENCE or part.num_rows > 1.02 * count:
+            break
+    if best is None:
+        raise _too_small(size, smallest)
+    return best
+
+
+def _coarsest(search: Search) -> float:
+    """Bytes of the fewest Gaussians as coarse as can be, evenly taken instead of the best."""
+    few = torch.arange(0, search.model.num_rows, max(1, search.model.num_rows // search.parts()[-1]))
+    part = select(search.model, few.to(search.model.device)[: search.parts()[-1]])
+    return FIXED_BYTES + sum(float(size[-1]) for size in search.coder.sizes(part).values())
+
+
+def _too_small(size: int, smallest: float) -> UserInputError:
+    return UserInputError(
+        f"no file of {size:,} bytes holds this scene: the smallest that is possible has about "
+        f"{math.ceil(SPARE * smallest):,} bytes"
+    )
+
+
+def for_quality(search: Search, quality: float, held_out: Pictures) -> Choice:
+    """The smallest estimate whose pictures at the cameras held out are as good as `quality`, dB.
+
+    Raises UserInputError where the finest settings are not that good.
+    """
+    wanted = 10 ** (-quality / 10)
+    found: list[Choice] = []
+    for count in search.parts():
+        part = search.part(count)
+        curves = search.errors.curves(search.coder, part)
+        lost = search.pictures.error(search.coder.rounded(part, search.coder.finest(part)))
+        if lost >= wanted and found:
+            break
+        allocation = _of_error(curves, max(wanted - lost, 0.02 * wanted))
+        found.append(Choice(part, curves, allocation))
+        search.tried.append((part.num_rows, found[-1].bytes, decibels(lost + allocation.error)))
+        best = min(range(len(found)), key=lambda i: found[i].bytes)
+        if len(found) - 1 - best == PATIENCE or part.num_rows > 1.02 * count or lost >= wanted:
+            break
+    finest = -math.inf
+    for choice in sorted(found, key=lambda each: each.bytes):
+        reached, measured = _measured(search, choice, quality, held_out)
+        if measured is not None:
+            return measured
+        finest = max(finest, reached)
+    raise UserInputError(
+        f"the finest settings reach {finest:.1f} dB against the source, which is less than {quality:g} dB"
+    )
+
+
+def _of_error(curves: Sequence[Curve], error: float) -> Allocation:
+    """The cheapest levels whose error by the tables is at most `error`, or the finest."""
+    low, high = -60.0, 20.0
+    best = at_price(curves, math.exp(low))
+    for _ in range(60):
+        middle = (low + high) / 2
+        found = at_price(curves, math.exp(middle))
+        if found.error > error:
+            high = middle
+        else:
+            low, best = middle, found
+    return best
+
+
+def _measured(search: Search, choice: Choice, quality: float, held_out: Pictures) -> tuple[float, Choice | None]:
+    """Return the dB reached last, and the choice made finer or coarser until it is as good as asked for, little better.
+
+    None where its finest settings are not that good.
+    """
+    wanted = choice.allocation.error
+    good: tuple[float, Choice] | None = None
+    bad: float | None = None
+    haste = 1.0
+    reached = -math.inf
+    for _ in range(QUALITY_TRIES):
+        found = Choice(choice.model, choice.curves, _of_error(choice.curves, wanted))
+        reached = held_out.quality(search.coder.rounded(found.model, found.allocation.levels)).psnr
+        if reached >= quality:
+            if good is None or found.bytes < good[1].bytes:
+                good = wanted, found
+            if reached <= quality + QUALITY_MARGIN:
+                break
+        else:
+            bad = wanted
+            if found.is_finest:
+                break
+        if good is not None and bad is not None:
+            wanted = math.sqrt(good[0] * bad)
+        else:  # part of the error may be of what was pruned, which no precision mends
+            wanted *= 10 ** (haste * (reached - quality - QUALITY_MARGIN / 2) / 10)
+            haste *= 2
+    return reached, None if good is None else good[1]

@@ -1,0 +1,82 @@
+"""Targets of a compressed file: its size, its quality, or how much smaller it is."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+
+from splatwizard_core.api import UserInputError
+
+UNITS = {
+    "": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 1 << 10, "mib": 1 << 20, "gib": 1 << 30,
+}  # fmt: skip
+LARGEST = 1 << 50
+LEAST_SHARE = 0.99
+"""Share of the target that a file fills at least, where the source can."""
+QUALITY_MARGIN = 0.2
+"""Decibels by which a file may be better than asked for."""
+USUAL_QUALITY = 40.0
+"""dB against the source, where nothing is asked for."""
+QUALITIES = (15.0, 70.0)
+
+
+@dataclass(frozen=True)
+class Target:
+    """One of the two is None.
+
+    size        bytes that the file may have at most
+    quality     dB against the source that it has at least, by cameras that were held out
+    """
+
+    size: int | None = None
+    quality: float | None = None
+
+    @classmethod
+    def of(
+        cls, size: str | int | None, quality: str | float | None, ratio: str | float | None, source_bytes: int | None
+    ) -> Target:
+        """Return what is asked for, at most one of three; else 40 dB. Raises UserInputError.
+
+        source_bytes    of the source file, which `ratio` divides
+        """
+        if sum(each is not None for each in (size, quality, ratio)) > 1:
+            raise UserInputError("a target is a size, a quality or a ratio: give one of them")
+        if size is not None:
+            return cls(size=parse_size(size))
+        if ratio is not None:
+            factor = _number(ratio, "ratio", 1, 1e6)
+            if source_bytes is None:
+                raise UserInputError("a ratio needs a file whose size it divides: give a size")
+            return cls(size=int(source_bytes / factor))
+        return cls(quality=USUAL_QUALITY if quality is None else parse_quality(quality))
+
+    def __str__(self) -> str:
+        return f"{self.size:,} bytes" if self.size is not None else f"{self.quality:g} dB"
+
+
+def parse_size(text: str | int) -> int:
+    """Return bytes of `8MB` (10^6), `8MiB` (2^20), `800kB` or a number of bytes. Raises UserInputError."""
+    match = re.fullmatch(r"\s*([0-9]+(?:\.[0-9]*)?|\.[0-9]+)\s*([a-zA-Z]*)\s*", str(text))
+    if match is None or match[2].lower() not in UNITS:
+        raise UserInputError(f"size '{text}' is none: give bytes, or a number with kB, MB, GB, KiB, MiB or GiB: 8MB")
+    found = float(match[1]) * UNITS[match[2].lower()]
+    if not 1 <= found <= LARGEST:
+        raise UserInputError(f"size '{text}' must be 1 byte to {LARGEST >> 40:,} TiB")
+    return int(found)
+
+
+def parse_quality(text: str | float) -> float:
+    """Return decibels of `45dB` or a number. Raises UserInputError."""
+    spelled = re.fullmatch(r"(.*?)\s*(?:dB)?\s*", str(text), re.IGNORECASE | re.DOTALL)
+    return _number(spelled[1] if spelled else text, "quality", *QUALITIES)
+
+
+def _number(value: str | float, what: str, low: float, high: float) -> float:
+    try:
+        found = float(value)
+    except ValueError:
+        found = math.nan
+    if not low <= found <= high:
+        raise UserInputError(f"{what} '{value}' must be a number in {low:g} .. {high:g}")
+    return found

@@ -1,0 +1,142 @@
+"""A small scene to a size and to a quality, by the library and the command."""
+
+import errno
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from click.testing import CliRunner
+from sw_compress import Compressed, compress, compressing
+from sw_compress.command import compress as command
+
+from splatwizard_core.api import UserInputError
+from splatwizard_core.tooling import ForeseenError, export_model, load_plugins, open_model, read_gaussians
+
+pytestmark = pytest.mark.pipeline
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory, ball) -> Path:
+    path = tmp_path_factory.mktemp("source") / "ball.ply"
+    export_model(ball(400), path, load_plugins())
+    return path
+
+
+@pytest.fixture(scope="module")
+def small(source, tmp_path_factory) -> Compressed:
+    return compress(source, size=7_000, views=6, device="cpu", out=tmp_path_factory.mktemp("out") / "small.swz")
+
+
+def test_the_size_is_met_and_never_exceeded(small):
+    assert 0.99 * 7_000 < small.out.stat().st_size <= 7_000
+    assert small.record["bytes"] == small.out.stat().st_size == sum(small.record["sections"].values())
+    assert small.record["encodes"] <= 4
+
+
+def test_the_file_opens_as_any_other(small):
+    model, reader = open_model(small.out, load_plugins(), torch.device("cpu"))
+    assert model.num_rows == small.record["gaussians"] == 400 - small.record["left_out"] - small.record["pruned"]
+    assert torch.equal(model.means, small.model.means)
+    assert reader.method == "3dgs"
+
+
+def test_the_record_holds_what_was_done(small):
+    record = json.loads(json.dumps(small.record))
+    assert record["quality"]["views"] == len(record["cameras"]["held_out"]) == 1
+    assert record["cameras"]["recipe"] == "plausible"
+    assert set(record["seconds"]) >= {"read", "cameras", "sensitivities", "search", "encode", "check", "total"}
+    assert record["quality"]["psnr"] > 25
+    assert record["loss_of_photographs"]["27"] < record["loss_of_photographs"]["36"]
+    held_out = {json.dumps(each) for each in record["cameras"]["held_out"]}
+    assert not held_out & {json.dumps(each) for part in ("fit", "judge") for each in record["cameras"][part]}
+
+
+def test_equal_calls_give_equal_bytes(source, small):
+    again = compress(source, size=7_000, views=6, device="cpu")
+    assert again.out is None
+    assert again.data == small.out.read_bytes()
+
+
+def test_a_small_file_is_met_too(source):
+    done = compress(source, size=4_000, views=6, device="cpu")
+    assert 0.99 * 4_000 < len(done.data) == done.record["bytes"] <= 4_000
+
+
+def test_a_larger_size_is_a_better_picture(source, small):
+    large = compress(source, size="12kB", views=6, device="cpu")
+    assert large.record["quality"]["psnr"] > small.record["quality"]["psnr"]
+
+
+def test_a_quality_is_reached_and_little_exceeded(source):
+    done = compress(source, quality="38dB", views=6, device="cpu")
+    assert 38 <= done.record["quality"]["psnr"] <= 38.4
+
+
+def test_more_than_the_finest_settings_give_is_told(source):
+    lines: list[str] = []
+    done = compress(source, size="1MB", views=6, device="cpu", say=lines.append)
+    assert done.record["bytes"] < 990_000
+    assert any("finest settings" in line for line in lines)
+
+
+def test_a_size_out_of_reach_names_one_that_works(source, tmp_path):
+    with pytest.raises(UserInputError, match="smallest"):
+        compress(source, size=400, views=6, device="cpu", out=tmp_path / "a.swz")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("stop", [KeyboardInterrupt(), OSError(errno.ENOSPC, "No space left on device")], ids=type)
+def test_an_interruption_and_a_full_disk_leave_nothing(source, tmp_path, monkeypatch, stop: BaseException):
+    out = tmp_path / "a.swz"
+    out.write_bytes(b"an older file")
+
+    def half_written(coder, choice, size, path, say):
+        path.write_bytes(b"half of it")
+        raise stop
+
+    monkeypatch.setattr(compressing, "_encoded", half_written)
+    with pytest.raises((KeyboardInterrupt, ForeseenError)):
+        compress(source, size="5kB", views=6, device="cpu", out=out, drop_unseen=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.swz"]
+    assert out.read_bytes() == b"an older file"
+
+
+@pytest.mark.parametrize("name", ["spz", "sog"])
+def test_other_formats_meet_the_size(source, tmp_path, name: str):
+    out = tmp_path / f"a.{name}"
+    done = compress(source, size="14kB", views=6, device="cpu", format=name, out=out, drop_unseen=True)
+    assert out.stat().st_size <= 14_000
+    assert done.record["bytes"] == out.stat().st_size
+    assert read_gaussians(out, load_plugins()).num_rows == done.record["gaussians"]
+
+
+def test_what_asks_for_antialiasing_still_does(tmp_path, ball):
+    model = ball(150)
+    model.origin = {"raster": {"antialias": True}}
+    done = compress(model, size="4kB", views=6, device="cpu", out=tmp_path / "a.swz")
+    assert done.record["antialiased"]
+    _, reader = open_model(tmp_path / "a.swz", load_plugins(), torch.device("cpu"))
+    assert reader.raster["antialias"] is True
+
+
+def test_the_number_and_the_degree_may_be_given(source):
+    done = compress(source, size="5kB", views=6, device="cpu", gaussians=250, sh_degree=0, drop_unseen=True)
+    assert (done.record["gaussians"], done.record["sh_degree"]) == (250, 0)
+
+
+def test_several_files_one_of_which_fails(source, tmp_path):
+    broken = tmp_path / "broken.ply"
+    broken.write_bytes(b"ply\nformat binary_little_endian 1.0\n")
+    options = ["--size", "5kB", "--views", "6", "--device", "cpu", "--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(command, [str(source), str(broken), *options])
+    assert done.exit_code == 1
+    assert "broken.ply" in done.output
+    assert (tmp_path / "out" / "ball.swz").stat().st_size <= 5_000
+    assert "smaller than ball.ply" in done.output
+
+
+def test_a_source_is_never_replaced(source):
+    done = CliRunner().invoke(command, [str(source), "--out", str(source)])
+    assert isinstance(done.exception, UserInputError)
+    assert "would be replaced" in str(done.exception)
