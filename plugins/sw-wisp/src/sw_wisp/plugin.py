@@ -1,4 +1,4 @@
-"""Registers the method wisp and its entropy model."""
+"""Registers the method wisp, and its parts: entropy model, context model, position codec."""
 
 from splatwizard_core.api import Registry, hookimpl
 
@@ -16,3 +16,15 @@ def register_methods(registry: Registry) -> None:
 def register_entropy_models(registry: Registry) -> None:
     registry.add("nested-gaussian", "sw_wisp.nested_model:NestedGaussian",
                  summary="integers under Gaussians, at once or coarse first and refined later")  # fmt: skip
+
+
+@hookimpl
+def register_context_models(registry: Registry) -> None:
+    registry.add("pyramid", "sw_wisp.pyramid_model:PyramidModel",
+                 summary="numbers of each splat from running means of those before it around its place")  # fmt: skip
+
+
+@hookimpl
+def register_coders(registry: Registry) -> None:
+    registry.add("leaf-octree", "sw_wisp.leaf_octree:LeafOctree", codes="positions",
+                 summary="point positions as octree occupancy, by the cells beside each")  # fmt: skip
