@@ -117,11 +117,11 @@ def test_it_decodes_the_golden_files_of_splats(path):
     assert_page_agrees_on_splats(path)
 
 
-@pytest.mark.parametrize(("context", "planes"), [("none", 1), ("pyramid", 2)])
+@pytest.mark.parametrize(("context", "planes"), [("none", 1), ("large", 2), ("small", 0)])
 def test_it_decodes_splats_in_packets(context, planes, tmp_path):
     """Three subsets, refinements, crowds and escapes, all SH bands, and values drawn towards centroids."""
     rng, draws, n = np.random.default_rng(0), torch.Generator().manual_seed(0), 80
-    net = ContextNetworks(generator=draws)
+    net = ContextNetworks(size="large" if context == "none" else context, generator=draws)
     for weight in net.parameters():
         weight.data.copy_(torch.randn(weight.shape, generator=draws) * 0.2)
     for network, width in zip(net.networks, (1, 6, 3, 12), strict=True):
@@ -136,7 +136,7 @@ def test_it_decodes_splats_in_packets(context, planes, tmp_path):
     ]
     scene = wisp_file.Scene(
         cube, levels, cells, values, (replace(layers[0], bias=np.zeros(0, np.int16)), *layers[1:]), planes=planes,
-        subsets=rng.choice(3, n, p=[0.2, 0.5, 0.3]), context=net.exact() if context == "pyramid" else None,
+        subsets=rng.choice(3, n, p=[0.2, 0.5, 0.3]), context=None if context == "none" else net.exact(),
         strengths=rng.random((planes + 1, 5)),
     )  # fmt: skip
     writer = container.ContainerWriter("wisp", 1)

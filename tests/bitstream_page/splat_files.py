@@ -205,10 +205,10 @@ class Pyramid:
     def __init__(self, file: Bytes, tables: ExactTables) -> None:
         self.tables = tables
         flags = file.one("B")
-        check(flags in (0, 1), "flags")
-        self.adaptive = flags == 1
+        check(flags < 4, "flags")
+        self.adaptive, halves = flags % 2 == 1, flags // 2
         self.means = Means(np.array(file.unpack("22h")) * 16)
-        flat = layers(file, [shape for i, h, o in NETWORKS for shape in ((h, i, 1), (o, h, 1))])
+        flat = layers(file, [s for i, h, o in NETWORKS for s in ((h >> halves, i, 1), (o, h >> halves, 1))])
         self.networks = [flat[i : i + 2] for i in range(0, 8, 2)]
         self.ties = {}
         for block in BLOCKS:

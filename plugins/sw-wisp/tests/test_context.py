@@ -50,12 +50,13 @@ def bits_of(state) -> np.ndarray:
 def test_counts_of_the_networks():
     counts = [sum(p.numel() for p in network.parameters()) for network in ContextNetworks().networks]
     assert counts == [2_339, 4_094, 2_695, 4_225]
+    assert sum(p.numel() for p in ContextNetworks(size="small").networks.parameters()) == 6_701
     assert sum(tie.numel() for tie in ContextNetworks().ties) == 18 + 6 + 96
 
 
-@pytest.mark.parametrize(("subsets", "planes"), [(1, 0), (3, 1), (2, 2)])
-def test_files_return(subsets, planes):
-    scene = replace(made_up(1200, subsets=subsets, planes=planes), context=some_networks().exact())
+@pytest.mark.parametrize(("subsets", "planes", "size"), [(1, 0, "large"), (3, 1, "small"), (2, 2, "large")])
+def test_files_return(subsets, planes, size):
+    scene = replace(made_up(1200, subsets=subsets, planes=planes), context=some_networks(size=size).exact())
     data, encoded = written(scene)
     decoded = file.decode(ContainerReader(data))
     assert decoded.digest() == encoded.decoded.digest()

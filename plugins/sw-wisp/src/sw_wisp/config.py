@@ -16,9 +16,7 @@ class Budget(Params):
 
     cap: int = Field(600_000, ge=1, description="most splats, times `budget.cap_factor`; half as many more may begin")
     cap_factor: float = Field(0.8, gt=0, le=10, description="what the rate points set")
-    worthless: float = Field(
-        0.2, ge=0, lt=1, description="largest share that conversion drops because the pictures are better without"
-    )
+    worthless: float = Field(0.2, ge=0, lt=1, description="largest share that is dropped first, as the pictures gain")
 
 
 class RateTerm(Params):
@@ -47,16 +45,10 @@ class Context(Params):
     """Prediction of the numbers of a splat."""
 
     kind: Literal["none", "pyramid"] = Field(
-        "pyramid",
-        description="none: a mean and a deviation for each number and level; pyramid: networks on running means of the "
-        "splats before",
+        "pyramid", description="none: a Gaussian by number and level; pyramid: networks on means of the splats before"
     )
-    fit: int = Field(
-        600,
-        ge=0,
-        le=100_000,
-        description="updates of the networks on bits alone when noise begins, no pictures",
-    )
+    networks: Literal["large", "small"] = Field("large", description="small: half as many hidden numbers")
+    fit: int = Field(600, ge=0, le=100_000, description="updates of the networks on bits alone when noise begins")
     rebuild: int = Field(200, ge=1, description="steps between measurements; half as many while numbers are rounded")
 
 
@@ -80,9 +72,7 @@ class Prune(Params):
     stop: int = Field(10_501, ge=1, description="no removal from this step on")
     every: int = Field(1_000, ge=1, description="steps between removals")
     share: float = Field(0.15, gt=0, lt=1, description="largest share of the splats that one of them takes")
-    respawn: float = Field(
-        1 / 3, ge=0, le=1, description="share of the removed ones that come back as copies of others"
-    )
+    respawn: float = Field(1 / 3, ge=0, le=1, description="share of the removed that comes back as copies of others")
     respawn_stop: int = Field(8_000, ge=0, description="none come back from this step on")
 
 

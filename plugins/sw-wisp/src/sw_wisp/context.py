@@ -33,8 +33,9 @@ def _residuals(drawn: Tensor, known: Forecast, unit: Tensor) -> tuple[Tensor, Te
 
 
 class ContextNetworks(nn.Module):
-    """Four networks, for opacity; shape and size; colour; latents: 13,353 numbers; ties of 120 within their blocks.
+    """Four networks, for opacity; shape and size; colour; latents; ties of 120 numbers within their blocks.
 
+    size        large, of 13,353 numbers, or small, of 6,701
     base_steps  [22] quantiser steps for a multiplier of 1
     prior       [22] int64 means where nothing is known, base steps with 12 fractional bits, multiples of 16
     adaptive    whether steps are what the networks say, or base steps
@@ -46,14 +47,15 @@ class ContextNetworks(nn.Module):
     multipliers: Tensor
 
     def __init__(
-        self, base_steps: Tensor | None = None, *, adaptive: bool = True, generator: torch.Generator | None = None
-    ) -> None:
+        self, base_steps: Tensor | None = None, *, size: str = "large", adaptive: bool = True,
+        generator: torch.Generator | None = None,
+    ) -> None:  # fmt: skip
         super().__init__()
         self.adaptive, self.rounds = adaptive, False
         self.ties = nn.ParameterList(torch.zeros(shape) for shape in tie_shapes())
         self.networks = nn.ModuleList(
             two_layers(inputs, hidden, outputs, generator, start="silent")
-            for inputs, hidden, outputs in network_shapes()
+            for inputs, hidden, outputs in network_shapes(size)
         )
         steps = torch.tensor(BASE_STEPS) if base_steps is None else base_steps
         self.register_buffer("base_steps", steps.float())

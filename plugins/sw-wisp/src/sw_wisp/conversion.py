@@ -91,7 +91,8 @@ def converted(
         steps = torch.tensor(config.base_steps)
         rate: StaticRate | PyramidRate = StaticRate(steps)
         if config.context.kind == "pyramid":
-            rate = PyramidRate(steps, adaptive=config.steps.adaptive, generator=generator)
+            size = config.context.networks
+            rate = PyramidRate(steps, adaptive=config.steps.adaptive, size=size, generator=generator)
         return WispModel(
             means, model.opacity_logits[rows], shape, size, colour_of(model.sh_dc)[rows], latents,
             cube.levels(middle_scales(shape, size), config.positions.eta), cube=cube,

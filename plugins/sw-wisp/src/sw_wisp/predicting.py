@@ -25,17 +25,18 @@ from sw_wisp.pyramid import BASE, FEATURES, VIEW, WAVES, Pyramid
 from sw_wisp.static import MEAN_UNIT
 from sw_wisp.ties import moved, pack_ties, tied_parts, unpack_ties
 
-HIDDEN = (32, 48, 32, 40)
+HIDDEN = {"large": (32, 48, 32, 40), "small": (16, 24, 16, 20)}
+"""Hidden numbers of the networks, by their size."""
 STEPS_OF = ([0], [0] * 5 + [1], [0] * 3, [0] * 12)
 """Which step output of its network each column has: shape and size differ, the others share one."""
-ADAPTIVE = 1
+ADAPTIVE, SMALL = 1, 2  # flags of the file
 
 
-def network_shapes() -> list[tuple[int, int, int]]:
+def network_shapes(size: str) -> list[tuple[int, int, int]]:
     """Inputs, hidden numbers and outputs of each network."""
     return [
         (FEATURES + block.start, hidden, 2 * (block.stop - block.start) + max(steps) + 1)
-        for block, hidden, steps in zip(BLOCKS, HIDDEN, STEPS_OF, strict=True)
+        for block, hidden, steps in zip(BLOCKS, HIDDEN[size], STEPS_OF, strict=True)
     ]
 
 
@@ -103,8 +104,9 @@ class PyramidContext:
 
     def pack(self) -> bytes:
         """Flags, prior, layers, ties."""
+        is_small = len(self.layers[0].weights) == HIDDEN["small"][0]
         return (
-            bytes([ADAPTIVE * self.adaptive])
+            bytes([ADAPTIVE * self.adaptive | SMALL * is_small])
             + (self.prior // MEAN_UNIT).astype("<i2").tobytes()
             + pack_layers(self.layers)
             + pack_ties(self.ties)
@@ -114,14 +116,15 @@ class PyramidContext:
     def unpack(cls, reader: ByteReader) -> PyramidContext:
         """Inverse of `pack`. Raises BitstreamError."""
         flags = reader.integer(1)
-        if flags > ADAPTIVE:
+        if flags > ADAPTIVE + SMALL:
             raise BitstreamError(f"the context has flags {flags}, which are not known")
         prior = np.frombuffer(reader.take(2 * NUMBERS), "<i2").astype(np.int64) * MEAN_UNIT
-        shapes = [shape for i, h, o in network_shapes() for shape in ((h, i, 1), (o, h, 1))]
+        sizes = network_shapes("small" if flags & SMALL else "large")
+        shapes = [shape for i, h, o in sizes for shape in ((h, i, 1), (o, h, 1))]
         layers, ties = unpack_layers(reader, shapes), unpack_ties(reader)
         if min(int(layer.exponents.min()) for layer in layers) < EXACT_EXPONENT:
             raise BitstreamError("a weight of the context is finer than its integers")
         try:
-            return cls(prior, layers, ties, flags == ADAPTIVE)
+            return cls(prior, layers, ties, flags & ADAPTIVE > 0)
         except ValueError as error:
             raise BitstreamError(f"the context networks cannot be used: {error}") from error

@@ -20,11 +20,13 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     "synthetic": {**GROWN, **SYNTHETIC},
     # Half the steps after a scene of preset `fast` of 3dgs.
     "fast": {"pretrained.preset": "fast", "iterations": 9_000, "scale_schedule": True},
-    # A CPU and the demo scene: a fifteenth of the steps, three removals; larger step sizes, since there are few steps.
+    # A CPU and the demo scene: a fifteenth of the steps, three removals; larger step sizes, since there are few steps,
+    # and small networks, since there are few splats.
     "quick": {
         "iterations": 1_200,
         "scale_schedule": True,
         "prune.every": 4_000,
+        "context.networks": "small",
         "context.rebuild": 600,
         "context.fit": 400,
         "lr.means.first": 8e-5,

@@ -157,10 +157,12 @@ class PyramidRate(nn.Module):
 
     CONTEXT = ("features", "view_features")
 
-    def __init__(self, steps: Tensor, *, adaptive: bool, generator: torch.Generator | None = None) -> None:
+    def __init__(
+        self, steps: Tensor, *, adaptive: bool, size: str = "large", generator: torch.Generator | None = None
+    ) -> None:
         super().__init__()
         self.adaptive, self.adapts = adaptive, False
-        self.networks = ContextNetworks(generator=generator)
+        self.networks = ContextNetworks(size=size, generator=generator)
         places = [
             (steps / self.networks.base_steps)[block].clamp(LEAST_MULTIPLIER, MOST_MULTIPLIER) for block in BLOCKS
         ]
