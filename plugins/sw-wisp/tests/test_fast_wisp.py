@@ -48,15 +48,15 @@ def agree(ours, theirs, tolerance=1e-4):
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("of", ["everything", "drawn values"])
 @pytest.mark.parametrize(
-    ("phase", "rounds", "moves_steps", "adaptive"),
+    ("phase", "rounds", "moves_steps", "adaptive", "size"),
     [
-        (FLOAT, False, True, True), (NOISE, False, True, True), (NOISE, False, False, True),
-        (NOISE, False, True, False), (SOFT, True, True, True), (HARD, True, True, True),
+        (FLOAT, False, True, True, "large"), (NOISE, False, True, True, "small"), (NOISE, False, False, True, "large"),
+        (NOISE, False, True, False, "large"), (SOFT, True, True, True, "large"), (HARD, True, True, True, "small"),
     ],
 )  # fmt: skip
-def test_forecasts_and_drawn_values(device, of, phase, rounds, moves_steps, adaptive, scene):
+def test_forecasts_and_drawn_values(device, of, phase, rounds, moves_steps, adaptive, size, scene):
     features, values = [each.to(device) for each in scene[0]], scene[1].to(device).requires_grad_()
-    net = some_networks(adaptive=adaptive).to(device)
+    net = some_networks(adaptive=adaptive, size=size).to(device)
     net.rounds = rounds
     weights = torch.rand(4, *values.shape, device=device)
     assert fit_kernels(values, *features)

@@ -91,8 +91,8 @@ def converted(
         steps = torch.tensor(config.base_steps)
         rate: StaticRate | PyramidRate = StaticRate(steps)
         if config.context.kind == "pyramid":
-            size = config.context.networks
-            rate = PyramidRate(steps, adaptive=config.steps.adaptive, size=size, generator=generator)
+            settings = {"adaptive": config.steps.adaptive, "size": config.context.networks}
+            rate = PyramidRate(steps, **settings, generator=generator)
         return WispModel(
             means, model.opacity_logits[rows], shape, size, colour_of(model.sh_dc)[rows], latents,
             cube.levels(middle_scales(shape, size), config.positions.eta), cube=cube,

@@ -8,6 +8,7 @@ since what networks are told of blocks before them is a constant.
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Sequence
 from typing import Any, Protocol
 
@@ -25,11 +26,10 @@ from sw_wisp.ties import tied_parts
 
 PHASES = {FLOAT: 0, FINAL: 0, NOISE: 1, SOFT: 2, HARD: 3}
 FEATURES, KNOWN = 69, BLOCKS[-1].start
-HIDDEN = (slice(0, 32), slice(32, 80), slice(80, 112), slice(112, 152))
 OUTPUTS = (slice(0, 3), slice(4, 18), slice(20, 27), slice(28, 53))
-ALL_HIDDEN, ALL_OUTPUTS = 152, 56
-"""Columns of the networks' hidden numbers and outputs, which share a matrix each. All begin at multiples of 16 bytes,
-as the optimizer's kernel asks of gradients."""
+ALL_OUTPUTS = 56
+"""Columns of the networks' outputs, which share a matrix, as hidden numbers do. All begin at multiples of 16 bytes, as
+the optimizer's kernel asks of gradients."""
 TOLD = (slice(0, 0), slice(0, 12), slice(12, 18), slice(18, 42))
 """Columns of what ties follow: residuals of a block, then their sizes."""
 
@@ -90,12 +90,13 @@ class _Predicted(torch.autograd.Function):
         inputs, view_inputs = (values.new_empty(rows, FEATURES + KNOWN) for _ in range(2))
         inputs[:, :FEATURES].copy_(features)
         view_inputs[:, :FEATURES].copy_(view_features)
-        hidden, outputs = values.new_empty(rows, ALL_HIDDEN), values.new_empty(rows, ALL_OUTPUTS)
+        columns = _hidden_columns([len(each) for each in weights[::2]])
+        hidden, outputs = values.new_empty(rows, columns[-1].stop), values.new_empty(rows, ALL_OUTPUTS)
         told = values.new_empty(rows, TOLD[-1].stop)
         phase = {"phase": PHASES[rounding.phase], "sharpness": rounding.sharpness, "adaptive": adaptive}
         for number, block in enumerate(BLOCKS):
             seen = (view_inputs if number == 3 else inputs)[:, : FEATURES + block.start]
-            inner, outer = hidden[:, HIDDEN[number]], outputs[:, OUTPUTS[number]]
+            inner, outer = hidden[:, columns[number]], outputs[:, OUTPUTS[number]]
             first, last = 2 * number, 2 * number + 1
             torch.addmm(biases[first], seen, weights[first].t(), out=inner)
             inner.relu_()
@@ -105,7 +106,7 @@ class _Predicted(torch.autograd.Function):
                 view_inputs=view_inputs, base_steps=base_steps, multipliers=multipliers, ties=ties,
                 mean=mean, scale=scale, steps=steps, drawn=drawn,
             )  # fmt: skip
-        ctx.phase, ctx.moves_steps, ctx.has_noise = phase, moves_steps, noise is not None
+        ctx.phase, ctx.moves_steps, ctx.has_noise, ctx.columns = phase, moves_steps, noise is not None, columns
         saved = [values, base_steps, mean, steps, inputs, view_inputs, hidden, outputs, told, *weights[1::2]]
         ctx.save_for_backward(*saved, *([] if noise is None else [noise]))
         ctx.set_materialize_grads(False)
@@ -132,17 +133,22 @@ class _Predicted(torch.autograd.Function):
             return (to_values, *others, *[None] * 21)
         to_hidden = torch.empty_like(hidden)
         for number, last in enumerate(lasts):
-            torch.mm(to_outputs[:, OUTPUTS[number]], last, out=to_hidden[:, HIDDEN[number]])
+            torch.mm(to_outputs[:, OUTPUTS[number]], last, out=to_hidden[:, ctx.columns[number]])
         torch.ops.aten.threshold_backward.grad_input(to_hidden, hidden, 0, grad_input=to_hidden)
         to_weights: list[Tensor | None] = []
         for number, block in enumerate(BLOCKS):
             seen = (view_inputs if number == 3 else inputs)[:, : FEATURES + block.start]
-            to_weights.append(torch.mm(to_hidden[:, HIDDEN[number]].t(), seen))
-            to_weights.append(torch.mm(to_outputs[:, OUTPUTS[number]].t(), hidden[:, HIDDEN[number]]))
+            to_weights.append(torch.mm(to_hidden[:, ctx.columns[number]].t(), seen))
+            to_weights.append(torch.mm(to_outputs[:, OUTPUTS[number]].t(), hidden[:, ctx.columns[number]]))
         inner, outer = to_hidden.sum(0), to_outputs.sum(0)
-        to_biases = [each for h, o in zip(HIDDEN, OUTPUTS, strict=True) for each in (inner[h], outer[o])]
+        to_biases = [each for h, o in zip(ctx.columns, OUTPUTS, strict=True) for each in (inner[h], outer[o])]
         to_ties = _to_ties(torch.mm(to_outputs.t(), told))
         return (to_values, *others, *to_weights, *to_ties, *to_biases)
+
+
+def _hidden_columns(widths: Sequence[int]) -> list[slice]:
+    """Columns of the hidden numbers of each network; widths are multiples of 4."""
+    return [slice(end - width, end) for width, end in zip(widths, itertools.accumulate(widths), strict=True)]
 
 
 def _to_ties(products: Tensor) -> list[Tensor]:
