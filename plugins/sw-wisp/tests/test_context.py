@@ -262,3 +262,11 @@ def test_white_noise_costs_what_it_must():
     noise = torch.randn(10_000, 3, generator=draws, dtype=torch.float64) * 0.3
     spent, marginal = colour_bits(plane(10_000, lambda at: noise))
     assert spent < 1.02 * marginal
+
+
+@pytest.mark.parametrize(("flags", "reason"), [(4, "flags 4"), (3, None)])
+def test_flags_of_other_networks_are_refused(flags, reason):
+    """Not known, or of small networks before large ones."""
+    data = bytes([flags]) + some_networks().exact().pack()[1:]
+    with pytest.raises(BitstreamError, match=reason):
+        PyramidContext.unpack(ByteReader(data))
