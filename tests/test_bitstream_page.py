@@ -141,8 +141,12 @@ def test_it_decodes_splats_in_packets(context, planes, tmp_path):
     )  # fmt: skip
     writer = container.ContainerWriter("wisp", 1)
     wisp_file.encode(scene, writer)
-    (tmp_path / "scene.swz").write_bytes(writer.to_bytes())
-    assert_page_agrees_on_splats(tmp_path / "scene.swz")
+    path, data = tmp_path / "scene.swz", writer.to_bytes()
+    ends = [cut["bytes"] for cut in container.ContainerReader(data).summary()["cuts"]]
+    assert len(ends) == 3 * (2 + planes)
+    for end in (ends[2], ends[-1]):  # a prefix in which subsets lack their latents, and the whole
+        path.write_bytes(data[:end])
+        assert_page_agrees_on_splats(path)
 
 
 def test_it_decodes_a_golden_file_that_ends_at_a_cut(tmp_path):

@@ -318,7 +318,8 @@ def coded_splats(static: dict[str, Any], sections: dict[str, bytes], tables: Exa
     shares = shares_of(file)
     context = Pyramid(file, tables) if static["context"] == "pyramid" else Statistics(file)
     state, rows_of = Splats(), {}
-    for number, (subset, kind, count) in enumerate(static["order"]):
+    viewed: set[int] = set()
+    for number, (subset, kind, count) in enumerate(static["order"][: len(sections) - 1]):
         data = sections[f"packet.{number + 1:02d}"]
         words = RangeWords(data)
         if kind == "base":
@@ -336,7 +337,14 @@ def coded_splats(static: dict[str, Any], sections: dict[str, bytes], tables: Exa
                         words, tables, block, part, planes if kind == "base" and block.start else 0, state, context
                     )
             context.learn(part, BASE if kind == "base" else LATENTS, None, state)
+        viewed |= {subset} if kind == "view" else set()
         check(next(words.words, None) is None, "words are left")
+    rows = [row for subset, own in rows_of.items() if subset not in viewed for row in own]
+    if rows:
+        mean, scale, m = context.predict(LATENTS, rows, state)
+        state.mean[rows, LATENTS] = np.clip(mean, -LIMIT, LIMIT)
+        state.scale[rows, LATENTS] = np.clip(scale, 0, 63 * 4096)
+        state.m[rows, LATENTS] = m
     return state, file
 
 

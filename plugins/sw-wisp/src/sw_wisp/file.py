@@ -1,8 +1,8 @@
 """The file of wisp: a header, one section of statistics and networks, and a section a packet.
 
 Section `networks`: probabilities of the octree, context (statistics or networks), strengths of centroids, appearance
-network. Sections `packet.01`, ...: the packets in the order of the header, each with one range coder. `cuts` are the
-bytes of all sections up to the end of each packet: a prefix of whole packets is a scene.
+network. Sections `packet.01`, ...: the packets in the order of the header, each with one range coder. The file may end
+after any of them that is worth it: a prefix of whole packets is a scene.
 """
 
 from __future__ import annotations
@@ -69,6 +69,7 @@ class Scene:
     context     None: statistics of the values by level and column
     in_order    whether splats of one cell keep their order; else the most opaque come first
     strengths   [planes + 1, 5] in 0..1 of the pull towards centroids, by missing refinements and group; None: 0
+    psnr        of the training views with the first 1, 2, ... packets, dB; None: not known
     """
 
     cube: Cube
@@ -84,6 +85,7 @@ class Scene:
     context: Context | None = None
     strengths: np.ndarray | None = None
     in_order: bool = False
+    psnr: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -151,11 +153,8 @@ def encode(scene: Scene, writer: ContainerWriter, choice: Choice = nearest) -> E
         tables=[tables.version, tables.crc], planes=scene.planes, context=context.kind, sh_degree=scene.sh_degree,
         order=[[p.subset, p.kind, p.rows] for p in packets], base_steps=steps.tolist(), low=list(scene.cube.low),
         edge=scene.cube.edge, appearance=[list(layer.shape) for layer in scene.appearance],
-        cuts=np.cumsum([len(each) for each in sections])[1:].tolist(),
     )  # fmt: skip
-    for name, data in zip(["networks", *map(section_name, range(len(packets)))], sections, strict=True):
-        writer.add(name, data)
-    writer.allow(len(levels) * BYTES_OF_A_ROW, f"a scene of {len(levels):,} splats")
+    _write_sections(writer, packets, sections, scene.psnr or (None,) * len(packets))
     decoded = Decoded(walk.state, scene.cube, steps, pulled, scene.appearance, scene.sh_degree)
     again = _decoded(context, shares, scene.planes, packets, sections[1:])
     if any(not np.array_equal(getattr(again, name), getattr(walk.state, name)) for name in ("index", "mean", "levels")):
@@ -163,11 +162,26 @@ def encode(scene: Scene, writer: ContainerWriter, choice: Choice = nearest) -> E
     return Encoded(rows, decoded)
 
 
-def decode(reader: ContainerReader, *, packets: int | None = None) -> Decoded:
-    """Read the scene that the first `packets` packets hold; None: all. Raises BitstreamError."""
+def _write_sections(
+    writer: ContainerWriter, packets: Sequence[Packet], sections: Sequence[bytes], psnr: Sequence[float | None]
+) -> None:
+    """Add the section `networks` and those of packets, with a cut after each that is not better without the next."""
+    writer.add("networks", sections[0])
+    rows = 0
+    for number, packet in enumerate(packets):
+        writer.add(section_name(number), sections[number + 1])
+        rows += packet.rows if packet.kind == "base" else 0
+        is_last = number == len(packets) - 1
+        if is_last or (sections[number + 2] and not (psnr[number] or 0) > (psnr[number + 1] or 0)):
+            writer.allow(rows * BYTES_OF_A_ROW, f"a scene of {rows:,} splats")
+            writer.cut(psnr[number])
+
+
+def decode(reader: ContainerReader) -> Decoded:
+    """Read the scene that the packets of a file, or of a prefix of it, hold. Raises BitstreamError."""
     header = _Header.read(reader)
-    taken = header.packets[: len(header.packets) if packets is None else packets]
-    reader.allow(sum(p.rows for p in header.packets if p.kind == "base") * BYTES_OF_A_ROW, "splats")
+    taken = header.packets[: len(reader.sections) - 1]
+    reader.allow(sum(p.rows for p in taken if p.kind == "base") * BYTES_OF_A_ROW, "splats")
     with reader.decoding("networks") as data:
         parts = ByteReader(data)
         shares = Shares.unpack(parts)
@@ -176,12 +190,11 @@ def decode(reader: ContainerReader, *, packets: int | None = None) -> Decoded:
         appearance = unpack_layers(parts, header.appearance)
         parts.finish()
     walk = Walk(context, shares, header.planes)
-    for number, packet in enumerate(header.packets):
+    for number, packet in enumerate(taken):
         with reader.decoding(section_name(number)) as data:
-            if number < len(taken):
-                stream = reader_of(data)
-                walk.packet(stream, packet)
-                stream.finish()
+            stream = reader_of(data)
+            walk.packet(stream, packet)
+            stream.finish()
     walk.finish()
     return Decoded(walk.state, header.cube, header.base_steps, strengths, appearance, header.sh_degree)
 
@@ -222,10 +235,11 @@ class _Header:
         check_order(packets, planes)
         if sum(p.rows for p in packets if p.kind == "base") > MOST_ROWS:
             raise BitstreamError(f"more than {MOST_ROWS:,} splats")
-        cuts = _integers(static, "cuts", len(packets), high=1 << 62)
         names = ["networks", *map(section_name, range(len(packets)))]
-        if list(reader.sections) != names or np.cumsum(list(reader.sections.values()))[1:].tolist() != cuts:
-            raise BitstreamError("sections are not those of the order of packets and its cuts")
+        there = len(reader.sections) if reader.cuts else len(names)  # files of before had no cuts
+        last = reader.cuts[-1].sections if reader.cuts else there
+        if last != len(names) or there < 2 or list(reader.sections) != names[:there]:
+            raise BitstreamError("sections are not those of the order of packets")
         low, steps = _floats(static, "low", 3, 1e30), _floats(static, "base_steps", NUMBERS, 1e30)
         if min(steps) <= 0:
             raise BitstreamError("a base step is not positive")
