@@ -1,0 +1,75 @@
+"""Prefixes of a model's file, drawn: which packet is worth its bytes next, and what each prefix shows in the end."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from splatwizard_core.api import ContainerReader, ContainerWriter, RasterOptions
+from splatwizard_core.tooling import Prefix
+from sw_wisp.file import decode, encode, section_name
+from sw_wisp.layers import Order, greedy_order, packet_bits
+from sw_wisp.model import WispModel, gaussians_of
+
+if TYPE_CHECKING:
+    from splatwizard_core.api import GaussianInputs, Rasterizer, SplatModel, View
+
+
+@torch.no_grad()
+def chosen_order(model: WispModel, views: Sequence[View], rasterizer: Rasterizer, background: Tensor) -> Order:
+    """Return the packets in the order in which each lowers the error of `views` by most for its estimated bits."""
+    forecast, drawn = model.predicted()
+    bits = packet_bits(drawn, forecast, model.place_bits().float(), model.layers.planes)
+    sums = {
+        kind: drawn.new_zeros(model.layers.subsets, dtype=torch.float64).index_add_(0, model.subsets, each.double())
+        for kind, each in bits.items()
+    }
+    sums["fine"] /= max(model.layers.planes, 1)
+
+    def error(packets: Sequence[tuple[int, str]]) -> float:
+        return squared_error(model.prefix_of(packets, forecast, drawn), views, rasterizer, background)
+
+    return greedy_order(model.layers, error, lambda packet: float(sums[packet[1]][packet[0]]))
+
+
+def squared_error(
+    gaussians: GaussianInputs, views: Sequence[View], rasterizer: Rasterizer, background: Tensor
+) -> float:
+    """Return the squared error of renders of `views`, summed over pixels and colours."""
+    options, total = RasterOptions(background=background), 0.0
+    for view in views:
+        image = rasterizer.render(gaussians, view.camera.to(background.device), options).image
+        total += float((image - view.image(background, background.device)).double().square().sum())
+    return total
+
+
+@torch.no_grad()
+def psnr_of_prefixes(
+    model: WispModel, views: Sequence[View], rasterizer: Rasterizer, background: Tensor
+) -> tuple[float, ...]:
+    """Return the mean PSNR of `views`, dB, with the first 1, 2, ... packets of the file, as decoders draw them."""
+    writer = ContainerWriter("wisp", 1)
+    encode(replace(model.coded(), psnr=None), writer)
+    data, found, last = writer.to_bytes(), [], 0.0
+    ends = [cut.sections for cut in ContainerReader(data).cuts]
+    for number in range(len(model.layers.order)):
+        if number + 2 in ends:  # else there is nothing in the packet
+            part = decode(ContainerReader(data, section_name(number), Prefix(ends.index(number + 2) + 1)))
+            last = _psnr(gaussians_of(part).to(background.device), views, rasterizer, background)
+        found.append(last)
+    return tuple(found)
+
+
+def _psnr(model: SplatModel, views: Sequence[View], rasterizer: Rasterizer, background: Tensor) -> float:
+    options, total = RasterOptions(background=background), 0.0
+    for view in views:
+        camera = view.camera.to(background.device)
+        image = rasterizer.render(model.gaussians(camera, rasterizer), camera, options).image.clamp(0, 1)
+        error = (image - view.image(background, background.device)).double().square().mean()
+        total += -10 * math.log10(max(float(error), 1e-10))
+    return total / len(views)
