@@ -12,9 +12,10 @@ from splatwizard_core.coding.container import ContainerReader
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.tooling import Prefix
 from splatwizard_core.training.pipeline import TrainingStopped
-from sw_wisp.layers import Known, Layers, admissible, as_known, greedy_order, packet_bits, split
+from sw_wisp.layers import Known, Layers, admissible, as_known, greedy_order, split
 from sw_wisp.method import Wisp
 from sw_wisp.packets import Packet, check_order
+from sw_wisp.prefixes import packet_bits
 from sw_wisp.rate import Forecast
 
 PROGRESSIVE = {**SHORT, "layers.progressive": True, "layers.views": 2}

@@ -9,11 +9,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from sw_wisp.nested import THIRD_OF_SCALE, UNIT
-from sw_wisp.numbers import LATENTS, NUMBERS, OPACITY
+from sw_wisp.numbers import LATENTS
 from sw_wisp.packets import REFINED, default_order
 from sw_wisp.rate import Forecast
-from sw_wisp.rate_model import bits_of
 
 Order = tuple[tuple[int, str], ...]
 """(subset, kind) of each packet."""
@@ -82,24 +80,6 @@ def as_known(values: Tensor, forecast: Forecast, known: Known) -> Tensor:
     values = values + coarse
     latents = torch.where(known.viewed[:, None], values[:, LATENTS.columns], forecast.mean[:, LATENTS.columns])
     return torch.cat([values[:, : LATENTS.columns.start], latents], dim=1)
-
-
-@torch.no_grad()
-def packet_bits(values: Tensor, forecast: Forecast, places: Tensor, planes: int) -> dict[str, Tensor]:
-    """Return the bits [N] that each kind of packet spends on splats; those of all refinements together.
-
-    values      [N,22] as rounded
-    places      [N] bits of their places
-    """
-    known = Known(*(places.new_full((len(places),), x, dtype=torch.int64) for x in (1, planes)), places >= 0)
-    widths = values.new_ones(NUMBERS)
-    widths[REFINED] = 3.0**planes
-    scale = forecast.scale - (widths > 1) * (planes * THIRD_OF_SCALE / UNIT)
-    coarse = bits_of(as_known(values, forecast, known), Forecast(forecast.mean, scale, forecast.steps * widths))
-    whole = bits_of(values, forecast)
-    base = coarse[:, REFINED].sum(1) + whole[:, OPACITY.columns].sum(1) + places
-    fine = (whole[:, REFINED].sum(1) - coarse[:, REFINED].sum(1)).clamp_min(0)
-    return {"base": base, "fine": fine, "view": whole[:, LATENTS.columns].sum(1)}
 
 
 def split(worth: Tensor, bits: Tensor, base: Tensor, levels: Tensor, shares: Sequence[float]) -> Tensor:

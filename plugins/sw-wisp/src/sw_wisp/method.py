@@ -10,7 +10,8 @@ import torch
 from splatwizard_core.api import BitstreamError, Method, SceneError
 from sw_wisp import file
 from sw_wisp.config import WispConfig
-from sw_wisp.model import WispModel, gaussians_of
+from sw_wisp.model import WispModel
+from sw_wisp.plain import gaussians_of
 from sw_wisp.presets import BY_DATASET, PRESETS, RATES
 from sw_wisp.stage import WispStage
 

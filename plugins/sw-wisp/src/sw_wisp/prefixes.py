@@ -13,11 +13,35 @@ from torch import Tensor
 from splatwizard_core.api import ContainerReader, ContainerWriter, RasterOptions
 from splatwizard_core.tooling import Prefix
 from sw_wisp.file import decode, encode, section_name
-from sw_wisp.layers import Order, greedy_order, packet_bits
-from sw_wisp.model import WispModel, gaussians_of
+from sw_wisp.layers import Known, Order, as_known, greedy_order
+from sw_wisp.nested import THIRD_OF_SCALE, UNIT
+from sw_wisp.numbers import LATENTS, NUMBERS, OPACITY
+from sw_wisp.packets import REFINED
+from sw_wisp.plain import gaussians_of
+from sw_wisp.rate import Forecast
+from sw_wisp.rate_model import bits_of
 
 if TYPE_CHECKING:
     from splatwizard_core.api import GaussianInputs, Rasterizer, SplatModel, View
+    from sw_wisp.model import WispModel
+
+
+@torch.no_grad()
+def packet_bits(values: Tensor, forecast: Forecast, places: Tensor, planes: int) -> dict[str, Tensor]:
+    """Return the bits [N] that each kind of packet spends on splats; those of all refinements together.
+
+    values      [N,22] as rounded
+    places      [N] bits of their places
+    """
+    known = Known(*(places.new_full((len(places),), x, dtype=torch.int64) for x in (1, planes)), places >= 0)
+    widths = values.new_ones(NUMBERS)
+    widths[REFINED] = 3.0**planes
+    scale = forecast.scale - (widths > 1) * (planes * THIRD_OF_SCALE / UNIT)
+    coarse = bits_of(as_known(values, forecast, known), Forecast(forecast.mean, scale, forecast.steps * widths))
+    whole = bits_of(values, forecast)
+    base = coarse[:, REFINED].sum(1) + whole[:, OPACITY.columns].sum(1) + places
+    fine = (whole[:, REFINED].sum(1) - coarse[:, REFINED].sum(1)).clamp_min(0)
+    return {"base": base, "fine": fine, "view": whole[:, LATENTS.columns].sum(1)}
 
 
 @torch.no_grad()

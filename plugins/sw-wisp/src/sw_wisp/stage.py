@@ -36,11 +36,11 @@ from sw_wisp.config import WispConfig
 from sw_wisp.conversion import converted
 from sw_wisp.cube import Cube
 from sw_wisp.file import Choice, encode, nearest
-from sw_wisp.layers import Layers, packet_bits, split
+from sw_wisp.layers import Layers, split
 from sw_wisp.model import WispModel
 from sw_wisp.numbers import GROUPS, LATENTS
 from sw_wisp.positions import MARGIN, levels_by_cost, middle_scales
-from sw_wisp.prefixes import chosen_order, psnr_of_prefixes
+from sw_wisp.prefixes import chosen_order, packet_bits, psnr_of_prefixes
 from sw_wisp.rdoq import RateDistortion
 from sw_wisp.removal import copy_some, unworthy
 from sw_wisp.rounding import FINAL, HARD, NOISE, SOFT
