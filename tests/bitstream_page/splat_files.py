@@ -403,7 +403,15 @@ def wisp(static: dict[str, Any], sections: dict[str, bytes], tables: ExactTables
     basis, first, last = layers(file, static["appearance"])
     file.done()
     units = state.mean + pulled(state, strengths, tables) * state.m
-    numbers = (units * np.array(static["base_steps"]) / 4096).astype(np.float32)
+    numbers = units * np.array(static["base_steps"]) / 4096
+    there = [count for _, kind, count in static["order"][: len(sections) - 1] if kind == "base"]
+    swell = static.get("swell", [])
+    if 0 < len(there) <= len(swell):
+        check(len(swell[len(there) - 1]) == 2 * len(there), "swell")
+        size, opacity = np.reshape(swell[len(there) - 1], (-1, 2)).T / 32
+        numbers[:, 6] += np.repeat(size, there)
+        numbers[:, 0] += np.repeat(opacity, there)
+    numbers = numbers.astype(np.float32)
     levels = np.array([level for level, _ in state.cells], np.int64)
     codes = [code for _, code in state.cells]
     cells = np.array(

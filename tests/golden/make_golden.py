@@ -13,6 +13,7 @@ import json
 import math
 import tempfile
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -272,7 +273,8 @@ def splats(n: int, context: str, subsets: int = 1) -> SplatModel:
     )  # fmt: skip
     if subsets > 1:
         model.subsets = torch.arange(n) % subsets
-        model.layers = Layers.of_subsets(subsets, 1)
+        layers = Layers.of_subsets(subsets, 1)
+        model.layers = replace(layers, swell=tuple(tuple(range(9, 9 + 2 * j)) for j in range(1, subsets)))
     model.begin_rate()
     model.phase = FINAL
     return model

@@ -145,6 +145,8 @@ CLAIMS = {
     "base steps": {"base_steps": [0.0] * 22},
     "few base steps": {"base_steps": [1.0] * 21},
     "planes": {"planes": 7},
+    "swell of one subset": {"swell": [[1, 1]]},
+    "swell that is none": {"swell": 7},
     "context": {"context": "oracle"},
     "edge": {"edge": -1.0},
     "corner": {"low": [1e300, 0, 0]},
@@ -162,6 +164,28 @@ def test_headers_that_make_no_sense_are_refused(claim):
         writer.add(name, reader.section(name))
     with pytest.raises(BitstreamError):
         file.decode(ContainerReader(writer.to_bytes()))
+
+
+SWELL = {
+    "rows": [[1, 2]],
+    "numbers": [[1, 2, 3], [1, 2, 3, 4]],
+    "text": [["a", 1], [1] * 4],
+    "large": [[1, 2], [200] * 4],
+}
+
+
+@pytest.mark.parametrize("claim", SWELL)
+def test_what_swells_prefixes_must_make_sense(claim):
+    scene = made_up(90, subsets=3, planes=1, swell=[[8, -4], [1, 2, 3, 4]])
+    data, _ = written(scene)
+    with pytest.raises(BitstreamError, match="swell"):
+        file.decode(ContainerReader(written(replace(scene, swell=SWELL[claim]))[0]))
+    part = file.decode(ContainerReader(data, prefix=Prefix(2)))
+    flat = file.decode(ContainerReader(written(replace(scene, swell=()))[0], prefix=Prefix(2)))
+    added = part.values() - flat.values()
+    assert torch.allclose(added[:, 6], torch.tensor(0.25), atol=1e-6)
+    assert torch.allclose(added[:, 0], torch.tensor(-0.125), atol=1e-6)
+    assert part.digest() == flat.digest()
 
 
 def test_flipped_bytes_within_sections_raise_or_decode_to_something():

@@ -1,6 +1,7 @@
 """Layers: subsets by worth, what prefixes know, the order of packets, and a training whose file can be cut."""
 
 import copy
+from dataclasses import replace
 
 import pytest
 import torch
@@ -15,10 +16,10 @@ from splatwizard_core.training.pipeline import TrainingStopped
 from sw_wisp.layers import Known, Layers, admissible, as_known, greedy_order, split
 from sw_wisp.method import Wisp
 from sw_wisp.packets import Packet, check_order
-from sw_wisp.prefixes import packet_bits
+from sw_wisp.prefixes import fitted_swell, packet_bits, squared_error
 from sw_wisp.rate import Forecast
 
-PROGRESSIVE = {**SHORT, "layers.progressive": True, "layers.views": 2}
+PROGRESSIVE = {**SHORT, "layers.progressive": True, "layers.views": 2, "layers.swell": 6, "context.fit": 60}
 
 
 @pytest.fixture(scope="module")
@@ -79,6 +80,20 @@ def test_what_is_drawn_of_a_prefix_is_what_decoders_draw(plain, plugins, toy, ra
             theirs = prefix(plugins, data, cut).gaussians(camera, rasterizer)
             images = [rasterizer.render(each, camera, RasterOptions()).image for each in (ours, theirs)]
         assert torch.allclose(*images, atol=2e-3), cut
+
+
+def test_what_swells_prefixes_lowers_their_loss(plain, toy, rasterizer):
+    model = copy.deepcopy(plain[1]).eval()
+    draws = torch.Generator().manual_seed(0)
+    found = fitted_swell(model, toy.scene.train, rasterizer, toy.scene.background, 24, draws)
+    assert [len(row) for row in found] == [2, 4, 6]
+    errors = []
+    for swell in ((), found):
+        model.layers = replace(model.layers, swell=swell)
+        with torch.no_grad():
+            prefix = model.prefix_of(model.layers.order[:1], *model.predicted())
+        errors.append(squared_error(prefix, toy.scene.train, rasterizer, toy.scene.background))
+    assert errors[1] < errors[0]
 
 
 def test_a_resumed_training_has_the_same_layers(train, plain, tmp_path):
@@ -146,7 +161,7 @@ def test_the_greedy_order_takes_what_is_worth_most_for_its_bits():
 
     order = greedy_order(layers, error, lambda packet: 10.0)
     letters = [f"{subset + 1}{kind[0]}" for subset, kind in order]
-    assert " ".join(letters) == "1b 1f 2b 2f 1v 3b 3f 2v 3v"
+    assert " ".join(letters) == "1b 1f 2b 2f 1v 2v 3b 3f 3v"
     check_order([Packet(subset, kind, 5) for subset, kind in order], 1)
     assert admissible([], layers) == [(0, "base")]
     assert len(admissible([(0, "base")], layers)) == 3

@@ -9,7 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from sw_wisp.numbers import LATENTS
+from sw_wisp.decoded import SWELL_UNIT
+from sw_wisp.numbers import LATENTS, NUMBERS, OPACITY, SIZE
 from sw_wisp.packets import REFINED, default_order
 from sw_wisp.rate import Forecast
 
@@ -28,11 +29,14 @@ class Layers:
     order       of them; empty: one subset, `base` and `view`
     planes      refinements of shape, size and colour that come after `base`
     psnr        of the training views with the first 1, 2, ... packets, dB; empty: not measured
+    swell       for 1, 2, ... of the subsets, while others are missing: of each of them what is added to size and
+                opacity, in 1/32; empty: nothing
     """
 
     order: Order = ()
     planes: int = 0
     psnr: tuple[float, ...] = ()
+    swell: tuple[tuple[int, ...], ...] = ()
 
     @classmethod
     def of_subsets(cls, subsets: int, planes: int) -> Layers:
@@ -43,6 +47,14 @@ class Layers:
     def subsets(self) -> int:
         """Number of subsets."""
         return max((subset for subset, _ in self.order), default=0) + 1
+
+    def swell_with(self, there: int, device: torch.device) -> Tensor | None:
+        """Return the additions [J,2] to size and opacity of each subset while so many are there; None: nothing."""
+        if not 0 < there <= len(self.swell):
+            return None
+        found = torch.zeros(self.subsets, 2, device=device)
+        found[:there] = torch.tensor(self.swell[there - 1], device=device).view(there, 2) / SWELL_UNIT
+        return found
 
 
 class Known(NamedTuple):
@@ -80,6 +92,14 @@ def as_known(values: Tensor, forecast: Forecast, known: Known) -> Tensor:
     values = values + coarse
     latents = torch.where(known.viewed[:, None], values[:, LATENTS.columns], forecast.mean[:, LATENTS.columns])
     return torch.cat([values[:, : LATENTS.columns.start], latents], dim=1)
+
+
+def swelled(values: Tensor, swell: Tensor) -> Tensor:
+    """Return values [N,22] with something added [N,2] to size and opacity."""
+    none = values.new_zeros(len(values), NUMBERS)
+    size, opacity = SIZE.columns.start, OPACITY.columns.start
+    parts = [none[:, :opacity], swell[:, 1:], none[:, opacity + 1 : size], swell[:, :1], none[:, size + 1 :]]
+    return values + torch.cat(parts, dim=1)
 
 
 def split(worth: Tensor, bits: Tensor, base: Tensor, levels: Tensor, shares: Sequence[float]) -> Tensor:

@@ -17,7 +17,7 @@ from sw_wisp.cube import Cube
 from sw_wisp.fast.kernels import fit_kernels
 from sw_wisp.fast.splats import drawable as fast_drawable
 from sw_wisp.file import Scene
-from sw_wisp.layers import Known, Layers, as_known
+from sw_wisp.layers import Known, Layers, as_known, swelled
 from sw_wisp.numbers import GROUPS, SIZE
 from sw_wisp.octree import Cells, position_bits
 from sw_wisp.plain import bounds_in, plain_gaussians
@@ -197,11 +197,21 @@ class WispModel(SplatModel):
             values = self.drawn()
         return self._inputs(values, extras)
 
-    def prefix_of(self, packets: Sequence[tuple[int, str]], forecast: Forecast, drawn: Tensor) -> GaussianInputs:
-        """Splats as some packets alone tell of them, of what `predicted` returned; those of other subsets invisible."""
-        known = Known.after(packets, self.layers, self.device).of(self.subsets)
-        found = self._inputs(as_known(drawn, forecast, known), {})
-        return replace(found, visible=known.there)
+    def prefix_of(
+        self, packets: Sequence[tuple[int, str]], forecast: Forecast, drawn: Tensor, swell: Tensor | None = None
+    ) -> GaussianInputs:
+        """Splats as some packets alone tell of them, of what `predicted` returned; those of other subsets invisible.
+
+        swell       [J,2] what is added to size and opacity of each subset; None: what the layers say
+        """
+        known = Known.after(packets, self.layers, self.device)
+        if swell is None:
+            swell = self.layers.swell_with(int(known.there.sum()), self.device)
+        known = known.of(self.subsets)
+        values = as_known(drawn, forecast, known)
+        if swell is not None:
+            values = swelled(values, swell[self.subsets])
+        return replace(self._inputs(values, {}), visible=known.there)
 
     def _inputs(self, values: Tensor, extras: dict[str, Tensor]) -> GaussianInputs:
         means, edges = self.means, self.log_edges(self.levels)
@@ -242,14 +252,14 @@ class WispModel(SplatModel):
             self.cube, levels, cells, values, self.network.layers(), sh_degree=self.network.degree,
             base_steps=tuple(self.rate.base_steps.tolist()), context=self.rate.exact(), in_order=self.phase == FINAL,
             subsets=self.subsets, order=self.layers.order or None, planes=self.layers.planes,
-            psnr=self.layers.psnr or None,
+            psnr=self.layers.psnr or None, swell=self.layers.swell,
         )  # fmt: skip
 
     def state_dict_extra(self) -> dict[str, Any]:
         modes = {"phase": self.phase, "sharpness": self.sharpness, "jitters": self.jitters}
         modes |= {"rounds": self.network.rounds, "adapts": self.adapts}
         modes |= {"order": [list(each) for each in self.layers.order], "planes": self.layers.planes}
-        modes |= {"psnr": list(self.layers.psnr)}
+        modes |= {"psnr": list(self.layers.psnr), "swell": [list(row) for row in self.layers.swell]}
         return {**modes, "seed": self.split_seed, "low": list(self.cube.low), "edge": self.cube.edge}
 
     def load_state_dict_extra(self, extra: dict[str, Any]) -> None:
@@ -261,6 +271,7 @@ class WispModel(SplatModel):
         if extra["adapts"]:
             self.adapt()
         order = tuple((int(subset), str(kind)) for subset, kind in extra["order"])
-        self.layers = Layers(order, int(extra["planes"]), tuple(float(x) for x in extra["psnr"]))
+        swell = tuple(tuple(int(x) for x in row) for row in extra["swell"])
+        self.layers = Layers(order, int(extra["planes"]), tuple(float(x) for x in extra["psnr"]), swell)
         low = [float(x) for x in extra["low"]]
         self.cube = Cube((low[0], low[1], low[2]), float(extra["edge"]))

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from splatwizard_core.api import ContainerReader, ContainerWriter, RasterOptions
+from splatwizard_core.api import ContainerReader, ContainerWriter, RasterOptions, photometric_loss
 from splatwizard_core.tooling import Prefix
-from sw_wisp.file import decode, encode, section_name
+from sw_wisp.decoded import SWELL_UNIT
+from sw_wisp.file import MOST_SWELL, decode, encode, section_name
 from sw_wisp.layers import Known, Order, as_known, greedy_order
 from sw_wisp.nested import THIRD_OF_SCALE, UNIT
 from sw_wisp.numbers import LATENTS, NUMBERS, OPACITY
@@ -24,6 +25,10 @@ from sw_wisp.rate_model import bits_of
 if TYPE_CHECKING:
     from splatwizard_core.api import GaussianInputs, Rasterizer, SplatModel, View
     from sw_wisp.model import WispModel
+
+
+SWELL_LR = 0.05
+"""Adam step size of the first update; it falls to 0."""
 
 
 @torch.no_grad()
@@ -61,6 +66,7 @@ def chosen_order(model: WispModel, views: Sequence[View], rasterizer: Rasterizer
     return greedy_order(model.layers, error, lambda packet: float(sums[packet[1]][packet[0]]))
 
 
+@torch.no_grad()
 def squared_error(
     gaussians: GaussianInputs, views: Sequence[View], rasterizer: Rasterizer, background: Tensor
 ) -> float:
@@ -70,6 +76,35 @@ def squared_error(
         image = rasterizer.render(gaussians, view.camera.to(background.device), options).image
         total += float((image - view.image(background, background.device)).double().square().sum())
     return total
+
+
+def fitted_swell(
+    model: WispModel, views: Sequence[View], rasterizer: Rasterizer, background: Tensor, updates: int,
+    draws: torch.Generator,
+) -> tuple[tuple[int, ...], ...]:  # fmt: skip
+    """Return for 1, 2, ... subsets, while others are missing, what is added to size and opacity of each, in 1/32.
+
+    Few splats then cover what those that are missing leave open. Found by so many updates for each number of subsets,
+    all else fixed, in turn over the prefixes that have so many.
+    """
+    with torch.no_grad():
+        forecast, drawn = model.predicted()
+    order, options, found = model.layers.order, RasterOptions(background=background), []
+    for there in range(1, model.layers.subsets):
+        ends = [n for n in range(1, len(order)) if sum(kind == "base" for _, kind in order[:n]) == there]
+        swell = torch.zeros(model.layers.subsets, 2, device=model.device, requires_grad=True)
+        optimizer = torch.optim.Adam([swell], lr=SWELL_LR)
+        for update in range(updates):
+            view = views[int(torch.randint(len(views), (), generator=draws))]
+            optimizer.param_groups[0]["lr"] = SWELL_LR * (1 - update / updates)
+            gaussians = model.prefix_of(order[: ends[update % len(ends)]], forecast, drawn, swell)
+            image = rasterizer.render(gaussians, view.camera.to(model.device), options).image
+            loss = photometric_loss(image, view.image(background, model.device)).total
+            (swell.grad,) = torch.autograd.grad(loss, [swell])
+            optimizer.step()
+        whole = (swell.detach() * SWELL_UNIT).round().clamp(-MOST_SWELL, MOST_SWELL).int()
+        found.append(tuple(whole[:there].flatten().tolist()))
+    return tuple(found)
 
 
 @torch.no_grad()

@@ -40,7 +40,7 @@ from sw_wisp.layers import Layers, split
 from sw_wisp.model import WispModel
 from sw_wisp.numbers import GROUPS, LATENTS
 from sw_wisp.positions import MARGIN, levels_by_cost, middle_scales
-from sw_wisp.prefixes import chosen_order, packet_bits, psnr_of_prefixes
+from sw_wisp.prefixes import chosen_order, fitted_swell, packet_bits, psnr_of_prefixes
 from sw_wisp.rdoq import RateDistortion
 from sw_wisp.removal import copy_some, unworthy
 from sw_wisp.rounding import FINAL, HARD, NOISE, SOFT
@@ -443,7 +443,11 @@ class WispStage(Stage):
         model.packets = None
         if model.layers.order:
             background = scene.background.to(model.device)
+            draws, updates = stream(model.split_seed, "swell"), self.config.layers.swell
             with still(model):
+                if updates:
+                    swell = fitted_swell(model, scene.train, self._rasterizer, background, updates, draws)
+                    model.layers = replace(model.layers, swell=swell)
                 psnr = psnr_of_prefixes(model, scene.train, self._rasterizer, background)
             model.layers = replace(model.layers, psnr=psnr)
         return model
