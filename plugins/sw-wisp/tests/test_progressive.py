@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from sw_kit import short_training
+from sw_kit.checks.prefixes import check_prefixes
 from sw_kit.short_training import file_of, psnr
 from test_training_wisp import SHORT, configured
 
@@ -64,6 +65,7 @@ def test_the_header_tells_what_each_prefix_shows(data, plugins, toy, rasterizer)
     for packets in (1, len(cuts)):
         shown = psnr(prefix(plugins, data, packets), toy.scene, rasterizer)
         assert shown == pytest.approx(cuts[packets - 1].psnr, abs=0.01)
+    assert "prefixes" in check_prefixes(data, lambda reader: Wisp(plugins, None).decode(reader))
     told = [cut.psnr for cut in cuts]
     assert told == sorted(told)
     assert told[0] < told[-1] - 1
