@@ -11,9 +11,8 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.api import ContainerReader, ContainerWriter, RasterOptions, photometric_loss
-from splatwizard_core.tooling import Prefix
 from sw_wisp.decoded import SWELL_UNIT
-from sw_wisp.file import MOST_SWELL, decode, encode, section_name
+from sw_wisp.file import MOST_SWELL, decode, encode
 from sw_wisp.layers import Known, Order, as_known, greedy_order
 from sw_wisp.nested import THIRD_OF_SCALE, UNIT
 from sw_wisp.numbers import LATENTS, NUMBERS, OPACITY
@@ -115,10 +114,11 @@ def psnr_of_prefixes(
     writer = ContainerWriter("wisp", 1)
     encode(replace(model.coded(), psnr=None), writer)
     data, found, last = writer.to_bytes(), [], 0.0
-    ends = [cut.sections for cut in ContainerReader(data).cuts]
+    whole = ContainerReader(data)
+    ends = {cut.sections: whole.header_bytes + cut.bytes for cut in whole.cuts}
     for number in range(len(model.layers.order)):
         if number + 2 in ends:  # else there is nothing in the packet
-            part = decode(ContainerReader(data, section_name(number), Prefix(ends.index(number + 2) + 1)))
+            part = decode(ContainerReader(data[: ends[number + 2]]))
             last = _psnr(gaussians_of(part).to(background.device), views, rasterizer, background)
         found.append(last)
     return tuple(found)

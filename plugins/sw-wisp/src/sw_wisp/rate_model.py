@@ -51,7 +51,7 @@ class Placed:
 
     values      [N,22] their numbers
     levels      [N] int64 levels of the octree, and cells [N,3] at these
-    subsets     [N] int64 which subset of the file each belongs to
+    subsets     [N] int64 which subset of the file each belongs to; None: all to one
     order       (subset, kind) of each packet; empty: that of one subset
     planes      refinements that come after the first packet of a subset
     """
@@ -59,7 +59,7 @@ class Placed:
     values: Tensor
     levels: Tensor
     cells: Tensor
-    subsets: Tensor
+    subsets: Tensor | None = None
     order: Sequence[tuple[int, str]] = ()
     planes: int = 0
 
