@@ -318,7 +318,8 @@ def coded_splats(static: dict[str, Any], sections: dict[str, bytes], tables: Exa
     shares = shares_of(file)
     context = Pyramid(file, tables) if static["context"] == "pyramid" else Statistics(file)
     state, rows_of = Splats(), {}
-    for number, (subset, kind, count) in enumerate(static["order"]):
+    viewed: set[int] = set()
+    for number, (subset, kind, count) in enumerate(static["order"][: len(sections) - 1]):
         data = sections[f"packet.{number + 1:02d}"]
         words = RangeWords(data)
         if kind == "base":
@@ -336,7 +337,14 @@ def coded_splats(static: dict[str, Any], sections: dict[str, bytes], tables: Exa
                         words, tables, block, part, planes if kind == "base" and block.start else 0, state, context
                     )
             context.learn(part, BASE if kind == "base" else LATENTS, None, state)
+        viewed |= {subset} if kind == "view" else set()
         check(next(words.words, None) is None, "words are left")
+    rows = [row for subset, own in rows_of.items() if subset not in viewed for row in own]
+    if rows:
+        mean, scale, m = context.predict(LATENTS, rows, state)
+        state.mean[rows, LATENTS] = np.clip(mean, -LIMIT, LIMIT)
+        state.scale[rows, LATENTS] = np.clip(scale, 0, 63 * 4096)
+        state.m[rows, LATENTS] = m
     return state, file
 
 
@@ -395,7 +403,15 @@ def wisp(static: dict[str, Any], sections: dict[str, bytes], tables: ExactTables
     basis, first, last = layers(file, static["appearance"])
     file.done()
     units = state.mean + pulled(state, strengths, tables) * state.m
-    numbers = (units * np.array(static["base_steps"]) / 4096).astype(np.float32)
+    numbers = units * np.array(static["base_steps"]) / 4096
+    there = [count for _, kind, count in static["order"][: len(sections) - 1] if kind == "base"]
+    swell = static.get("swell", [])
+    if 0 < len(there) <= len(swell):
+        check(len(swell[len(there) - 1]) == 2 * len(there), "swell")
+        size, opacity = np.reshape(swell[len(there) - 1], (-1, 2)).T / 32
+        numbers[:, 6] += np.repeat(size, there)
+        numbers[:, 0] += np.repeat(opacity, there)
+    numbers = numbers.astype(np.float32)
     levels = np.array([level for level, _ in state.cells], np.int64)
     codes = [code for _, code in state.cells]
     cells = np.array(

@@ -13,6 +13,7 @@ import json
 import math
 import tempfile
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -246,10 +247,14 @@ def settled(n: int, degree: int = 3, anchor: str = "center") -> GaussianModel:
     return settled_copy(procedural(n, degree), settings, seed=0)
 
 
-def splats(n: int, context: str) -> SplatModel:
-    """n splats of Wisp with scattered numbers that are fixed, in cells of levels 3 to 6, some of them shared."""
+def splats(n: int, context: str, subsets: int = 1) -> SplatModel:
+    """n splats of Wisp with scattered numbers that are fixed, in cells of levels 3 to 6, some of them shared.
+
+    subsets     in so many of them, with one refinement, if there is more than one
+    """
     from sw_wisp.appearance import AppearanceNetwork
     from sw_wisp.cube import Cube
+    from sw_wisp.layers import Layers
     from sw_wisp.model import WispModel
     from sw_wisp.numbers import BASE_STEPS
     from sw_wisp.rate_model import PyramidRate, StaticRate
@@ -266,6 +271,10 @@ def splats(n: int, context: str) -> SplatModel:
         values(n, 3), 3 * values(n), 2 * values(n, 5), values(n) - 2, values(n, 3), values(n, 12),
         3 + torch.arange(n) % 4, cube=Cube((-1.0, -1.0, -1.0), 2.0), network=network, rate=rate,
     )  # fmt: skip
+    if subsets > 1:
+        model.subsets = torch.arange(n) % subsets
+        layers = Layers.of_subsets(subsets, 1)
+        model.layers = replace(layers, swell=tuple(tuple(range(9, 9 + 2 * j)) for j in range(1, subsets)))
     model.begin_rate()
     model.phase = FINAL
     return model
@@ -339,6 +348,9 @@ CASES: dict[str, Case] = {
     "mesongs_empty_v1": ("mesongs", "r3", {}, lambda: settled(0)),
     "wisp_v1": ("wisp", "r3", {}, lambda: splats(90, "pyramid")),
     "wisp_none_v1": ("wisp", "r5", {}, lambda: splats(90, "none")),
+    "wisp_v2": ("wisp", "r3", {}, lambda: splats(90, "pyramid")),
+    "wisp_none_v2": ("wisp", "r5", {}, lambda: splats(90, "none")),
+    "wisp_packets_v2": ("wisp", "r3", {}, lambda: splats(60, "none", 3)),
 }
 """File -> method, rate point, other values of its configuration, model."""
 
@@ -346,6 +358,8 @@ SUPERSEDED = {
     "hac_exact_v1": "hac_exact_v2",
     "hac_half_v1": "hac_half_v2",
     "cat_3dgs_refined_v1": "cat_3dgs_refined_v2",
+    "wisp_v1": "wisp_v2",
+    "wisp_none_v1": "wisp_none_v2",
 }
 """Files whose layout is read, and no longer written -> the file of the same model that is."""
 

@@ -1,6 +1,7 @@
 import contextlib
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import torch
 from wisp_scenes import made_up
 
 from splatwizard_core.api import BitstreamError, ContainerReader, ContainerWriter
+from splatwizard_core.tooling import Prefix
 from sw_wisp import file
 from sw_wisp.nested import Counter
 from sw_wisp.numbers import BASE_STEPS, LIMITS
@@ -64,7 +66,7 @@ def test_every_prefix_is_exact_and_what_is_final_stays(subsets):
     data, encoded = written(made_up(600, subsets=subsets, planes=1))
     count, whole = 3 * subsets, encoded.decoded.state
     for packets in range(1, count + 1):
-        state = file.decode(ContainerReader(data), packets=packets).state
+        state = file.decode(ContainerReader(data, prefix=Prefix(packets))).state
         n = len(state.levels)
         assert np.array_equal(state.levels, whole.levels[:n])
         assert np.array_equal(state.mean[:, :10], whole.mean[:n, :10])
@@ -77,20 +79,24 @@ def test_every_prefix_is_exact_and_what_is_final_stays(subsets):
         assert (state.index[~state.has_view, 10:] == 0).all()
 
 
-def test_the_last_packets_are_not_looked_at_by_a_prefix():
-    scene = made_up(600, subsets=2, planes=1)
-    data, _ = written(scene)
-    reader = ContainerReader(data)
-    cut = reader.header_bytes + reader.static["cuts"][3]
-    first = file.decode(reader, packets=4).digest()
-    damaged = bytearray(data)
-    writer = ContainerWriter("wisp", 1)
-    writer.static.update(reader.static)
-    for name in reader.sections:
-        late = name > file.section_name(3) and name != "networks"
-        writer.add(name, bytes(len(reader.section(name))) if late else reader.section(name))
-    assert file.decode(ContainerReader(writer.to_bytes()), packets=4).digest() == first
-    assert cut < len(damaged)
+def test_a_file_that_ends_at_a_cut_is_what_its_packets_are():
+    data, _ = written(made_up(600, subsets=2, planes=1))
+    for packets, cut in enumerate(ContainerReader(data).summary()["cuts"], 1):
+        part = file.decode(ContainerReader(data, prefix=Prefix(packets)))
+        assert file.decode(ContainerReader(data[: cut["bytes"]])).digest() == part.digest()
+    assert packets == 6
+
+
+def test_cuts_that_are_not_worth_it_are_none():
+    psnr = (20.0, 21.0, 20.5, 20.5, 22.0, 23.0)
+    reader = ContainerReader(written(made_up(600, subsets=2, planes=1, psnr=psnr))[0])
+    assert [(cut.sections, cut.psnr) for cut in reader.cuts] == [
+        (2, 20.0), (4, 20.5), (5, 20.5), (6, 22.0), (7, 23.0)
+    ]  # fmt: skip
+    two = replace(made_up(600, subsets=2, planes=1), subsets=np.zeros(600, int), order=default_order(2, 1))
+    empty = ContainerReader(written(two)[0])
+    assert [cut.sections for cut in empty.cuts] == [2, 4, 7]  # packets of no splats have no bytes
+    assert len(file.decode(empty)) == 600
 
 
 def test_order_for_four_subsets():
@@ -132,14 +138,15 @@ CLAIMS = {
     "other rows": {"order": [[0, "base", 301], [0, "view", 301]]},
     "view first": {"order": [[0, "view", 300], [0, "base", 300]]},
     "fine without planes": {"order": [[0, "base", 300], [0, "fine", 300]]},
-    "cuts": {"cuts": [5, 4]},
-    "cuts of text": {"cuts": ["a", "b"]},
+    "more packets": {"order": [[0, "base", 300], [0, "view", 300], [1, "base", 0], [1, "view", 0]]},
     "no subset 0": {"order": [[1, "base", 300], [1, "view", 300]]},
     "unknown kind": {"order": [[0, "basis", 300], [0, "view", 300]]},
     "an order that is none": {"order": 7},
     "base steps": {"base_steps": [0.0] * 22},
     "few base steps": {"base_steps": [1.0] * 21},
     "planes": {"planes": 7},
+    "swell of one subset": {"swell": [[1, 1]]},
+    "swell that is none": {"swell": 7},
     "context": {"context": "oracle"},
     "edge": {"edge": -1.0},
     "corner": {"low": [1e300, 0, 0]},
@@ -157,6 +164,28 @@ def test_headers_that_make_no_sense_are_refused(claim):
         writer.add(name, reader.section(name))
     with pytest.raises(BitstreamError):
         file.decode(ContainerReader(writer.to_bytes()))
+
+
+SWELL = {
+    "rows": [[1, 2]],
+    "numbers": [[1, 2, 3], [1, 2, 3, 4]],
+    "text": [["a", 1], [1] * 4],
+    "large": [[1, 2], [200] * 4],
+}
+
+
+@pytest.mark.parametrize("claim", SWELL)
+def test_what_swells_prefixes_must_make_sense(claim):
+    scene = made_up(90, subsets=3, planes=1, swell=[[8, -4], [1, 2, 3, 4]])
+    data, _ = written(scene)
+    with pytest.raises(BitstreamError, match="swell"):
+        file.decode(ContainerReader(written(replace(scene, swell=SWELL[claim]))[0]))
+    part = file.decode(ContainerReader(data, prefix=Prefix(2)))
+    flat = file.decode(ContainerReader(written(replace(scene, swell=()))[0], prefix=Prefix(2)))
+    added = part.values() - flat.values()
+    assert torch.allclose(added[:, 6], torch.tensor(0.25), atol=1e-6)
+    assert torch.allclose(added[:, 0], torch.tensor(-0.125), atol=1e-6)
+    assert part.digest() == flat.digest()
 
 
 def test_flipped_bytes_within_sections_raise_or_decode_to_something():
@@ -184,8 +213,7 @@ def test_cut_sections_raise_or_decode_to_something():
         for keep in (0, 1, 4, len(reader.section(name)) - 4):
             writer = ContainerWriter("wisp", 1)
             parts = {n: reader.section(n)[: keep if n == name else None] for n in reader.sections}
-            cuts = np.cumsum([len(part) for part in parts.values()])[1:].tolist()
-            writer.static.update(reader.static | {"cuts": cuts})
+            writer.static.update(reader.static)
             for other, part in parts.items():
                 writer.add(other, part)
             with contextlib.suppress(BitstreamError):

@@ -119,6 +119,11 @@ class Viewer:
             if wait == 0:
                 return
 
+    def renew(self, label: str) -> None:
+        """Open a model again, for all who look at it: its file has changed."""
+        self._shown_models.pop(label, None)
+        self.generation += 1
+
     def stop(self) -> None:
         """Close all connections and the port."""
         stop_server(self.server)

@@ -14,9 +14,10 @@ from sw_codecs.entropy.exact_tables import exact_tables
 from sw_wisp.cube import Cube
 from sw_wisp.eight_bits import EightBitLayer
 from sw_wisp.nested import UNIT, table_levels
-from sw_wisp.numbers import GROUPS, OPACITY
+from sw_wisp.numbers import GROUPS, OPACITY, SIZE
 from sw_wisp.packets import REFINED, State
 
+SWELL_UNIT = 32
 ERFC = np.vectorize(math.erfc, otypes=[np.float64])
 
 
@@ -31,6 +32,7 @@ class Decoded:
                 it, by refinements that are missing and by group
     appearance  layers of the network that turns latents into SH bands
     sh_degree   of those bands
+    swell       [N,2] what is added to size and opacity, since splats of other subsets are missing
     """
 
     state: State
@@ -39,6 +41,7 @@ class Decoded:
     strengths: np.ndarray
     appearance: tuple[EightBitLayer, ...]
     sh_degree: int
+    swell: np.ndarray
 
     def __len__(self) -> int:
         return len(self.state.cells)
@@ -61,7 +64,9 @@ class Decoded:
             widths = np.ones(units.shape, np.int64)
             widths[:, REFINED] = 3 ** self.state.planes.astype(np.int64)[:, None]
             units += pulled * self.state.multiplier * to_centroid(self.state.index, self.state.scale, widths)
-        return torch.from_numpy((units * (self.base_steps / UNIT)).astype(np.float32))
+        found = units * (self.base_steps / UNIT)
+        found[:, [SIZE.columns.start, OPACITY.columns.start]] += self.swell
+        return torch.from_numpy(found.astype(np.float32))
 
     def means(self) -> Tensor:
         """Positions [N,3] float32, world units."""

@@ -1,8 +1,8 @@
 """The file of wisp: a header, one section of statistics and networks, and a section a packet.
 
 Section `networks`: probabilities of the octree, context (statistics or networks), strengths of centroids, appearance
-network. Sections `packet.01`, ...: the packets in the order of the header, each with one range coder. `cuts` are the
-bytes of all sections up to the end of each packet: a prefix of whole packets is a scene.
+network. Sections `packet.01`, ...: the packets in the order of the header, each with one range coder. The file may end
+after any of them that is worth it: a prefix of whole packets is a scene.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from sw_codecs.entropy.exact_tables import exact_tables
 from sw_codecs.positions import morton
 from sw_wisp import numbers
 from sw_wisp.cube import Cube, splat_cells
-from sw_wisp.decoded import Decoded
+from sw_wisp.decoded import SWELL_UNIT, Decoded
 from sw_wisp.eight_bits import EightBitLayer, pack_layers, unpack_layers
 from sw_wisp.fast.streams import reader_of
 from sw_wisp.nested import UNIT, Writer
@@ -51,6 +51,8 @@ BYTES_OF_A_ROW = 4 * NUMBERS * 4 + 5 * 8 + 59 * 4
 """Of memory that a decoded splat takes: its integers, its cell, and the Gaussian."""
 MOST_ROWS = 1 << 26
 MOST_LAYERS, WIDEST = 16, 4096
+MOST_SWELL = 127
+Swell = Sequence[Sequence[int]]
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,9 @@ class Scene:
     context     None: statistics of the values by level and column
     in_order    whether splats of one cell keep their order; else the most opaque come first
     strengths   [planes + 1, 5] in 0..1 of the pull towards centroids, by missing refinements and group; None: 0
+    psnr        of the training views with the first 1, 2, ... packets, dB; None: not known
+    swell       for 1, 2, ... of the subsets, while others are missing: of each of them what is added to size and
+                opacity, in 1/32; empty: nothing
     """
 
     cube: Cube
@@ -84,6 +89,8 @@ class Scene:
     context: Context | None = None
     strengths: np.ndarray | None = None
     in_order: bool = False
+    psnr: tuple[float, ...] | None = None
+    swell: Swell = ()
 
 
 @dataclass(frozen=True)
@@ -151,23 +158,38 @@ def encode(scene: Scene, writer: ContainerWriter, choice: Choice = nearest) -> E
         tables=[tables.version, tables.crc], planes=scene.planes, context=context.kind, sh_degree=scene.sh_degree,
         order=[[p.subset, p.kind, p.rows] for p in packets], base_steps=steps.tolist(), low=list(scene.cube.low),
         edge=scene.cube.edge, appearance=[list(layer.shape) for layer in scene.appearance],
-        cuts=np.cumsum([len(each) for each in sections])[1:].tolist(),
+        **({"swell": [list(row) for row in scene.swell]} if len(scene.swell) else {}),
     )  # fmt: skip
-    for name, data in zip(["networks", *map(section_name, range(len(packets)))], sections, strict=True):
-        writer.add(name, data)
-    writer.allow(len(levels) * BYTES_OF_A_ROW, f"a scene of {len(levels):,} splats")
-    decoded = Decoded(walk.state, scene.cube, steps, pulled, scene.appearance, scene.sh_degree)
+    _write_sections(writer, packets, sections, scene.psnr or (None,) * len(packets))
+    decoded = Decoded(
+        walk.state, scene.cube, steps, pulled, scene.appearance, scene.sh_degree, np.zeros((len(levels), 2))
+    )
     again = _decoded(context, shares, scene.planes, packets, sections[1:])
     if any(not np.array_equal(getattr(again, name), getattr(walk.state, name)) for name in ("index", "mean", "levels")):
         raise RuntimeError("a packet does not decode to what was encoded; please report this")
     return Encoded(rows, decoded)
 
 
-def decode(reader: ContainerReader, *, packets: int | None = None) -> Decoded:
-    """Read the scene that the first `packets` packets hold; None: all. Raises BitstreamError."""
+def _write_sections(
+    writer: ContainerWriter, packets: Sequence[Packet], sections: Sequence[bytes], psnr: Sequence[float | None]
+) -> None:
+    """Add the section `networks` and those of packets, with a cut after each that is not better without the next."""
+    writer.add("networks", sections[0])
+    rows = 0
+    for number, packet in enumerate(packets):
+        writer.add(section_name(number), sections[number + 1])
+        rows += packet.rows if packet.kind == "base" else 0
+        is_last = number == len(packets) - 1
+        if is_last or (sections[number + 2] and not (psnr[number] or 0) > (psnr[number + 1] or 0)):
+            writer.allow(rows * BYTES_OF_A_ROW, f"a scene of {rows:,} splats")
+            writer.cut(psnr[number])
+
+
+def decode(reader: ContainerReader) -> Decoded:
+    """Read the scene that the packets of a file, or of a prefix of it, hold. Raises BitstreamError."""
     header = _Header.read(reader)
-    taken = header.packets[: len(header.packets) if packets is None else packets]
-    reader.allow(sum(p.rows for p in header.packets if p.kind == "base") * BYTES_OF_A_ROW, "splats")
+    taken = header.packets[: len(reader.sections) - 1]
+    reader.allow(sum(p.rows for p in taken if p.kind == "base") * BYTES_OF_A_ROW, "splats")
     with reader.decoding("networks") as data:
         parts = ByteReader(data)
         shares = Shares.unpack(parts)
@@ -176,14 +198,20 @@ def decode(reader: ContainerReader, *, packets: int | None = None) -> Decoded:
         appearance = unpack_layers(parts, header.appearance)
         parts.finish()
     walk = Walk(context, shares, header.planes)
-    for number, packet in enumerate(header.packets):
+    for number, packet in enumerate(taken):
         with reader.decoding(section_name(number)) as data:
-            if number < len(taken):
-                stream = reader_of(data)
-                walk.packet(stream, packet)
-                stream.finish()
+            stream = reader_of(data)
+            walk.packet(stream, packet)
+            stream.finish()
     walk.finish()
-    return Decoded(walk.state, header.cube, header.base_steps, strengths, appearance, header.sh_degree)
+    there = [p.rows for p in taken if p.kind == "base"]
+    swell = np.zeros((len(there), 2))
+    if len(there) <= len(header.swell):
+        swell = np.reshape(header.swell[len(there) - 1], (-1, 2)) / SWELL_UNIT
+    return Decoded(
+        walk.state, header.cube, header.base_steps, strengths, appearance, header.sh_degree,
+        np.repeat(swell, there, axis=0),
+    )  # fmt: skip
 
 
 def section_name(number: int) -> str:
@@ -200,6 +228,7 @@ class _Header:
     base_steps: np.ndarray
     appearance: tuple[tuple[int, int, int], ...]
     sh_degree: int
+    swell: Swell
 
     @classmethod
     def read(cls, reader: ContainerReader) -> _Header:
@@ -222,17 +251,31 @@ class _Header:
         check_order(packets, planes)
         if sum(p.rows for p in packets if p.kind == "base") > MOST_ROWS:
             raise BitstreamError(f"more than {MOST_ROWS:,} splats")
-        cuts = _integers(static, "cuts", len(packets), high=1 << 62)
         names = ["networks", *map(section_name, range(len(packets)))]
-        if list(reader.sections) != names or np.cumsum(list(reader.sections.values()))[1:].tolist() != cuts:
-            raise BitstreamError("sections are not those of the order of packets and its cuts")
+        there = len(reader.sections) if reader.cuts else len(names)  # files of before had no cuts
+        last = reader.cuts[-1].sections if reader.cuts else there
+        if last != len(names) or there < 2 or list(reader.sections) != names[:there]:
+            raise BitstreamError("sections are not those of the order of packets")
         low, steps = _floats(static, "low", 3, 1e30), _floats(static, "base_steps", NUMBERS, 1e30)
         if min(steps) <= 0:
             raise BitstreamError("a base step is not positive")
         cube = Cube((low[0], low[1], low[2]), reader.number("edge", low=1e-30, high=1e30))
         layers = [tuple(_within(row, [WIDEST, WIDEST, 1])) for row in _rows(static, "appearance", MOST_LAYERS)]
         shapes = tuple((rows, columns, bias) for rows, columns, bias in layers)
-        return cls(packets, planes, context, cube, np.array(steps), shapes, reader.integer("sh_degree", low=0, high=3))
+        degree = reader.integer("sh_degree", low=0, high=3)
+        return cls(packets, planes, context, cube, np.array(steps), shapes, degree, _swell(static, packets))
+
+
+def _swell(static: dict[str, Any], packets: Sequence[Packet]) -> Swell:
+    """Rows for 1, 2, ... subsets, but not all, of two numbers for each of them; nothing where the file tells none."""
+    if "swell" not in static:
+        return ()
+    rows, subsets = _rows(static, "swell", MOST_SUBSETS), sum(p.kind == "base" for p in packets)
+    if len(rows) != subsets - 1 or any(len(row) != 2 * there for there, row in enumerate(rows, 1)):
+        raise BitstreamError("header value 'swell' has not two numbers for each of 1, 2, ... subsets but the last")
+    if any(type(n) is not int or abs(n) > MOST_SWELL for row in rows for n in row):
+        raise BitstreamError(f"header value 'swell' holds something else than integers up to {MOST_SWELL}")
+    return rows
 
 
 def _rows(static: dict[str, Any], key: str, most: int) -> list[Any]:

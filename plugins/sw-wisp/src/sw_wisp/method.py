@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -10,9 +9,9 @@ import torch
 
 from splatwizard_core.api import BitstreamError, Method, SceneError
 from sw_wisp import file
-from sw_wisp.appearance import AppearanceNetwork
 from sw_wisp.config import WispConfig
-from sw_wisp.model import WispModel, plain_gaussians
+from sw_wisp.model import WispModel
+from sw_wisp.plain import gaussians_of
 from sw_wisp.presets import BY_DATASET, PRESETS, RATES
 from sw_wisp.stage import WispStage
 
@@ -53,10 +52,7 @@ class Wisp(Method):
     def decode(self, reader: ContainerReader) -> SplatModel:
         self.check_version(reader)
         decoded = file.decode(reader)
-        levels = torch.from_numpy(decoded.state.levels)
-        log_edges = math.log(decoded.cube.edge) - math.log(2.0) * levels
         try:
-            network = AppearanceNetwork.of_layers(decoded.appearance, decoded.sh_degree)
+            return gaussians_of(decoded)
         except ValueError as error:
             raise BitstreamError(f"{reader.name}: {error}", section="networks") from error
-        return plain_gaussians(decoded.means(), decoded.values(), log_edges.float(), decoded.cube, network)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -11,46 +12,24 @@ from torch import Tensor, nn
 
 from splatwizard_core.api import SH, GaussianInputs, GaussianModel, SplatModel
 from sw_codecs.positions import morton
-from sw_wisp.appearance import AppearanceNetwork, sh_dc_of
+from sw_wisp.appearance import AppearanceNetwork
 from sw_wisp.cube import Cube
 from sw_wisp.fast.kernels import fit_kernels
 from sw_wisp.fast.splats import drawable as fast_drawable
 from sw_wisp.file import Scene
+from sw_wisp.layers import Known, Layers, as_known, swelled
 from sw_wisp.numbers import GROUPS, SIZE
 from sw_wisp.octree import Cells, position_bits
+from sw_wisp.plain import bounds_in, plain_gaussians
 from sw_wisp.pyramid import FEATURES
 from sw_wisp.rate import Forecast
 from sw_wisp.rate_model import Placed, PyramidRate, StaticRate, bits_of
 from sw_wisp.rounding import AS_THEY_ARE, FINAL, FLOAT, HARD, Rounding
-from sw_wisp.shape import bounded, scales_and_quats
+from sw_wisp.shape import bounded
 from sw_wisp.splats import drawable
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Camera, Rasterizer
-
-THINNEST = 1e-6
-"""Smallest standard deviation, in edges of the root cube; the largest is the edge itself."""
-
-
-def bounds_in(cube: Cube) -> tuple[float, float]:
-    """Return the bounds of the log scales of splats in a root cube."""
-    return math.log(THINNEST * cube.edge), math.log(cube.edge)
-
-
-@torch.no_grad()
-def plain_gaussians(
-    means: Tensor, values: Tensor, log_edges: Tensor, cube: Cube, network: AppearanceNetwork
-) -> GaussianModel:
-    """Return splats as Gaussians that need no network to be drawn.
-
-    means       [N,3] world units
-    values      [N,22] their numbers
-    log_edges   [N] logarithms of the edges of their cells
-    """
-    opacity, shape, size, colour, latents = (values[:, group.columns] for group in GROUPS)
-    log_scales, quats = scales_and_quats(shape, size.squeeze(1) + log_edges)
-    log_scales, rest = log_scales.clamp(*bounds_in(cube)), network(latents, colour)
-    return GaussianModel.from_tensors(means, sh_dc_of(colour), rest, opacity.squeeze(1), log_scales, quats)
 
 
 class WispModel(SplatModel):
@@ -63,6 +42,7 @@ class WispModel(SplatModel):
     colour      [N,3] luma and chroma
     latents     [N,12] view dependence
     levels      [N] int64, level of the octree
+    subsets     [N] int64, which subset of the file it belongs to
     features, view_features
                 [N,69] what networks of the rate model see of the splats before; only where it has networks
     network     latents and colour to SH bands 1 and up
@@ -74,13 +54,16 @@ class WispModel(SplatModel):
     jitters     whether positions are drawn anywhere in a cell of the splat's level around them
     adapts      whether quantiser steps may follow the rate model
     counted     share of all splats whose bits are counted at each step
+    layers      packets of the file
+    packets     how many of them are drawn in training; None: all
     """
 
-    ROWS = ("means", "opacity", "shape", "size", "colour", "latents", "levels")
+    ROWS = ("means", "opacity", "shape", "size", "colour", "latents", "levels", "subsets")
     NUMBERS = ("opacity", "shape", "size", "colour", "latents")
     """The parameters that hold the 22 numbers, in their order."""
 
     levels: Tensor
+    subsets: Tensor
 
     def __init__(
         self, means: Tensor, opacity: Tensor, shape: Tensor, size: Tensor, colour: Tensor, latents: Tensor,
@@ -94,6 +77,7 @@ class WispModel(SplatModel):
         for name, values in rows.items():
             self.register_parameter(name, nn.Parameter(values.detach().float().contiguous()))
         self.register_buffer("levels", levels)
+        self.register_buffer("subsets", torch.zeros_like(levels))
         for name in rate.CONTEXT:
             if name not in self.ROWS:
                 self.register_buffer(name, means.new_zeros(len(means), FEATURES))
@@ -102,6 +86,7 @@ class WispModel(SplatModel):
         self.cube = cube
         self.phase, self.sharpness, self.sharpest, self.jitters, self.adapts = FLOAT, 1.0, sharpest, False, False
         self.split_seed, self.counted = 0, 0.0
+        self.layers, self.packets = Layers(), None
 
     def log_edges(self, levels: Tensor) -> Tensor:
         """Logarithms [N] of the edges of cells at levels [N]."""
@@ -184,7 +169,9 @@ class WispModel(SplatModel):
         self._take(self.rate.measure(self._placed(), self._context, fixed=self.phase == FINAL))
 
     def _placed(self) -> Placed:
-        return Placed(self.numbers().detach(), self.levels, self.cube.cells(self.means, self.levels))
+        cells = self.cube.cells(self.means, self.levels)
+        order, planes = self.layers.order, self.layers.planes
+        return Placed(self.numbers().detach(), self.levels, cells, self.subsets, order, planes)
 
     def _take(self, rows: Mapping[str, Tensor]) -> None:
         for name, values in rows.items():
@@ -200,12 +187,33 @@ class WispModel(SplatModel):
     def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
         """All splats, whatever the camera; in training `extras["bits"]` [S,22] are those of the splats that count."""
         extras = {}
+        if self.training and self.packets is not None:
+            return self.prefix_of(self.layers.order[: self.packets], *self.predicted())
         if self.training and self.counted:
             n = self.num_rows
             sample = torch.randint(n, (max(1, math.ceil(self.counted * n)),), device=self.device)
             values, extras["bits"] = self.drawn_and_bits(sample)
         else:
             values = self.drawn()
+        return self._inputs(values, extras)
+
+    def prefix_of(
+        self, packets: Sequence[tuple[int, str]], forecast: Forecast, drawn: Tensor, swell: Tensor | None = None
+    ) -> GaussianInputs:
+        """Splats as some packets alone tell of them, of what `predicted` returned; those of other subsets invisible.
+
+        swell       [J,2] what is added to size and opacity of each subset; None: what the layers say
+        """
+        known = Known.after(packets, self.layers, self.device)
+        if swell is None:
+            swell = self.layers.swell_with(int(known.there.sum()), self.device)
+        known = known.of(self.subsets)
+        values = as_known(drawn, forecast, known)
+        if swell is not None:
+            values = swelled(values, swell[self.subsets])
+        return replace(self._inputs(values, {}), visible=known.there)
+
+    def _inputs(self, values: Tensor, extras: dict[str, Tensor]) -> GaussianInputs:
         means, edges = self.means, self.log_edges(self.levels)
         if self.jitters and self.training:
             means = means + (torch.rand_like(means) - 0.5) * edges.exp()[:, None]
@@ -243,11 +251,15 @@ class WispModel(SplatModel):
         return Scene(
             self.cube, levels, cells, values, self.network.layers(), sh_degree=self.network.degree,
             base_steps=tuple(self.rate.base_steps.tolist()), context=self.rate.exact(), in_order=self.phase == FINAL,
+            subsets=self.subsets, order=self.layers.order or None, planes=self.layers.planes,
+            psnr=self.layers.psnr or None, swell=self.layers.swell,
         )  # fmt: skip
 
     def state_dict_extra(self) -> dict[str, Any]:
         modes = {"phase": self.phase, "sharpness": self.sharpness, "jitters": self.jitters}
         modes |= {"rounds": self.network.rounds, "adapts": self.adapts}
+        modes |= {"order": [list(each) for each in self.layers.order], "planes": self.layers.planes}
+        modes |= {"psnr": list(self.layers.psnr), "swell": [list(row) for row in self.layers.swell]}
         return {**modes, "seed": self.split_seed, "low": list(self.cube.low), "edge": self.cube.edge}
 
     def load_state_dict_extra(self, extra: dict[str, Any]) -> None:
@@ -258,5 +270,8 @@ class WispModel(SplatModel):
             self.rate.round_weights()
         if extra["adapts"]:
             self.adapt()
+        order = tuple((int(subset), str(kind)) for subset, kind in extra["order"])
+        swell = tuple(tuple(int(x) for x in row) for row in extra["swell"])
+        self.layers = Layers(order, int(extra["planes"]), tuple(float(x) for x in extra["psnr"]), swell)
         low = [float(x) for x in extra["low"]]
         self.cube = Cube((low[0], low[1], low[2]), float(extra["edge"]))

@@ -8,6 +8,7 @@ Gaussian of the table's deviation, and `exact` is what the file holds.
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
@@ -50,11 +51,17 @@ class Placed:
 
     values      [N,22] their numbers
     levels      [N] int64 levels of the octree, and cells [N,3] at these
+    subsets     [N] int64 which subset of the file each belongs to; None: all to one
+    order       (subset, kind) of each packet; empty: that of one subset
+    planes      refinements that come after the first packet of a subset
     """
 
     values: Tensor
     levels: Tensor
     cells: Tensor
+    subsets: Tensor | None = None
+    order: Sequence[tuple[int, str]] = ()
+    planes: int = 0
 
 
 def bits_of(values: Tensor, forecast: Forecast, last: int | None = None) -> Tensor:
@@ -180,7 +187,7 @@ class PyramidRate(nn.Module):
         """Start from these splats, whose running means it predicts; return rows of the model to predict from."""
         units = splats.values / self.base_steps
         self.networks.measure_prior(units)
-        features = self._features(splats, units, (units - self.networks.prior / UNIT).round())
+        features = self._features(splats, units, (units - self.networks.prior / UNIT).round(), torch.ones_like(units))
         self.networks.start(*features, units)
         self._set_steps()
         return dict(zip(self.CONTEXT, features, strict=True))
@@ -227,10 +234,14 @@ class PyramidRate(nn.Module):
         """
         forecast, drawn = self._predict(context, splats.values, AS_THEY_ARE if fixed else Rounding(HARD), True)
         indices = ((drawn - forecast.mean) / forecast.steps).round()
-        return dict(zip(self.CONTEXT, self._features(splats, drawn / self.base_steps, indices), strict=True))
+        steps = forecast.steps / self.base_steps
+        return dict(zip(self.CONTEXT, self._features(splats, drawn / self.base_steps, indices, steps), strict=True))
 
-    def _features(self, splats: Placed, units: Tensor, indices: Tensor) -> tuple[Tensor, Tensor]:
-        return walked_features(self.networks.prior, splats.levels, splats.cells, units, indices, make=pyramid_of)
+    def _features(self, splats: Placed, units: Tensor, indices: Tensor, steps: Tensor) -> tuple[Tensor, Tensor]:
+        return walked_features(
+            self.networks.prior, splats.levels, splats.cells, units, indices, labels=splats.subsets,
+            order=splats.order or None, planes=splats.planes, multipliers=steps, make=pyramid_of,
+        )  # fmt: skip
 
     def predict(self, context: tuple[Tensor, ...], values: Tensor, rounding: Rounding) -> tuple[Forecast, Tensor]:
         """Return distributions of values [N,22], and the values as they are drawn under these; differentiable."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -35,9 +36,11 @@ from sw_wisp.config import WispConfig
 from sw_wisp.conversion import converted
 from sw_wisp.cube import Cube
 from sw_wisp.file import Choice, encode, nearest
+from sw_wisp.layers import Layers, split
 from sw_wisp.model import WispModel
 from sw_wisp.numbers import GROUPS, LATENTS
 from sw_wisp.positions import MARGIN, levels_by_cost, middle_scales
+from sw_wisp.prefixes import chosen_order, fitted_swell, packet_bits, psnr_of_prefixes
 from sw_wisp.rdoq import RateDistortion
 from sw_wisp.removal import copy_some, unworthy
 from sw_wisp.rounding import FINAL, HARD, NOISE, SOFT
@@ -59,6 +62,9 @@ class WispStage(Stage):
     3. PLACE    positions become cell centres
     4. ROUND    noise becomes soft rounding, soft rounding hard rounding
     5. FREEZE   the integers are fixed; the appearance network learns on
+
+    With `layers.progressive` splats get subsets at PLACE, some steps draw the first packets alone from then on, and
+    the order of packets is chosen before FREEZE.
     """
 
     name = "wisp"
@@ -98,6 +104,7 @@ class WispStage(Stage):
 
     def begin(self, context: StageContext) -> SplatModel:
         model, scene = context.model, context.scene
+        self._rasterizer = context.rasterizer
         views = scene.train
         self._pixels = sum(view.camera.width * view.camera.height for view in views) / len(views)
         if not isinstance(model, GaussianModel):
@@ -157,7 +164,12 @@ class WispStage(Stage):
             range(phases.hard, phases.freeze, max(rebuild // 2, 1)),
         ):
             scheduler.register_task(self.when(measured), self.measure, name="measure rate model")
+        if self.config.layers.progressive:
+            scheduler.register_task(self.when(phases.order), self.order_packets, name="order packets")
         scheduler.register_task(self.when(phases.freeze), self.freeze, name="fix integers")
+        if self.config.layers.progressive and self.config.layers.train:
+            drawn = self.when(range(phases.prefixes, self.config.FULL_ITERATIONS + 1))
+            scheduler.register_task(drawn, self.draw_prefix, name="draw some packets alone")
 
     def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
         if self.config.prune.rd:
@@ -173,6 +185,25 @@ class WispStage(Stage):
         """Let the bits of some splats be counted at a step where they have a price."""
         priced = self.price(step) > 0 and step < self.step_of(self.config.phases.freeze)
         model.counted = self.config.rate_term.sample if priced else 0.0
+        model.packets = None
+
+    def draw_prefix(self, model: WispModel) -> None:
+        """Draw some of the packets alone at this step, or all."""
+        if len(model.layers.order) > 1 and float(torch.rand(())) < self.config.layers.train:
+            model.packets = int(torch.randint(1, len(model.layers.order), ()))
+            model.counted = 0.0  # bits are counted when all is drawn
+
+    def order_packets(
+        self, model: WispModel, cameras: CameraIterator, rasterizer: Rasterizer, scene: Scene, log: TaskLog
+    ) -> None:
+        """Choose the order of packets by what each is worth to some training views."""
+        views = some_views(cameras, stream(model.split_seed, "order"))[: self.config.layers.views]
+        self.measure(model)
+        with still(model):
+            order = chosen_order(model, views, rasterizer, scene.background.to(model.device))
+        model.layers = replace(model.layers, order=order)
+        self.measure(model)
+        log.say("packets: " + " ".join(f"{subset + 1}{kind[0]}" for subset, kind in order))
 
     def begin_noise(self, model: WispModel, cameras: CameraIterator, rasterizer: Rasterizer, scene: Scene) -> None:
         """Draw numbers with uniform noise from here on; the rate model learns what they are like as they stand."""
@@ -232,6 +263,8 @@ class WispStage(Stage):
         model.levels, cells = model.cube.settled(model.means, model.levels, model.opacity)
         model.means.copy_(model.cube.centres(model.levels, cells))
         model.jitters = False
+        if self.config.layers.progressive:
+            self.split(model, cameras, rasterizer, scene.background.to(model.device))
         self.measure(model)
         self.fit(model, cameras, rasterizer, scene.background.to(model.device), "place")
 
@@ -300,6 +333,18 @@ class WispStage(Stage):
         log.scalar("added", added)
 
     # Parts
+
+    def split(self, model: WispModel, views: list[View], rasterizer: Rasterizer, background: Tensor) -> None:
+        """Put splats into the subsets of the file, those worth most for their bits into the first."""
+        layers = self.config.layers
+        with still(model):
+            found = self.worth(model, views, rasterizer, background)
+            forecast, drawn = model.predicted()
+            places = model.place_bits().float()
+        bits = packet_bits(drawn, forecast, places, layers.planes)
+        whole = bits["base"] + bits["fine"] + bits["view"]
+        model.subsets = split(found.squared_error, whole, bits["base"], model.levels, layers.shares)
+        model.layers = Layers.of_subsets(len(layers.shares), layers.planes)
 
     def worth(self, model: SplatModel, views: list[View], rasterizer: Rasterizer, background: Tensor) -> Worth:
         """Return what each splat is worth to all training views."""
@@ -383,12 +428,29 @@ class WispStage(Stage):
         total, parts = pack.total, dict(pack.parts)
         if config.loss.opacity and step < self.step_of(config.loss.opacity_stop):
             total = total + config.loss.opacity * result.inputs.opacities.mean()
+        if model.packets is not None:
+            total = total * config.layers.weight
         if "bits" in result.extras:
             counted = result.extras["bits"]
             bits = counted.sum() / len(counted)
             parts["bits"] = bits.detach()  # of a splat's 22 numbers
             total = total + self.price(step) * model.num_rows * bits
         return LossPack(total, parts)
+
+    def finish(self, model: SplatModel, scene: Scene) -> SplatModel:
+        """Measure what each prefix of the file shows, if it has layers."""
+        assert isinstance(model, WispModel)
+        model.packets = None
+        if model.layers.order:
+            background = scene.background.to(model.device)
+            draws, updates = stream(model.split_seed, "swell"), self.config.layers.swell
+            with still(model):
+                if updates:
+                    swell = fitted_swell(model, scene.train, self._rasterizer, background, updates, draws)
+                    model.layers = replace(model.layers, swell=swell)
+                psnr = psnr_of_prefixes(model, scene.train, self._rasterizer, background)
+            model.layers = replace(model.layers, psnr=psnr)
+        return model
 
 
 def some_views(views: list[View], draws: torch.Generator) -> list[View]:

@@ -1,0 +1,169 @@
+"""Layers: subsets by worth, what prefixes know, the order of packets, and a training whose file can be cut."""
+
+import copy
+from dataclasses import replace
+
+import pytest
+import torch
+from sw_kit import short_training
+from sw_kit.checks.prefixes import check_prefixes
+from sw_kit.short_training import file_of, psnr
+from test_training_wisp import SHORT, configured
+
+from splatwizard_core.coding.container import ContainerReader
+from splatwizard_core.rendering.rasterizer import RasterOptions
+from splatwizard_core.tooling import Prefix
+from splatwizard_core.training.pipeline import TrainingStopped
+from sw_wisp.layers import Known, Layers, admissible, as_known, greedy_order, split
+from sw_wisp.method import Wisp
+from sw_wisp.packets import Packet, check_order
+from sw_wisp.prefixes import fitted_swell, packet_bits, squared_error
+from sw_wisp.rate import Forecast
+
+PROGRESSIVE = {**SHORT, "layers.progressive": True, "layers.views": 2, "layers.swell": 6, "context.fit": 60}
+
+
+@pytest.fixture(scope="module")
+def train(plugins, rasterizer, toy):
+    def run(directory=None, stop_after=None, **values):
+        method = configured(plugins, **{**PROGRESSIVE, **values})
+        model, _ = short_training.train(
+            method, toy.scene, rasterizer, model=lambda: None, trained={"3dgs": toy.truth}.__getitem__,
+            checkpoint_every=40, directory=directory, stop_after=stop_after,
+        )  # fmt: skip
+        return method, model
+
+    return run
+
+
+def on_one_thread(train, **values):
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        return train(**values)
+    finally:
+        torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def data(train):
+    return file_of(*on_one_thread(train))
+
+
+@pytest.fixture(scope="module")
+def plain(train):
+    return on_one_thread(train, context__kind="none")
+
+
+def prefix(plugins, data, packets):
+    return Wisp(plugins, None).decode(ContainerReader(data, "file.swz", Prefix(packets)))
+
+
+def test_the_header_tells_what_each_prefix_shows(data, plugins, toy, rasterizer):
+    cuts = ContainerReader(data).cuts
+    assert len(cuts) >= 8
+    for packets in (1, len(cuts)):
+        shown = psnr(prefix(plugins, data, packets), toy.scene, rasterizer)
+        assert shown == pytest.approx(cuts[packets - 1].psnr, abs=0.01)
+    assert "prefixes" in check_prefixes(data, lambda reader: Wisp(plugins, None).decode(reader))
+    told = [cut.psnr for cut in cuts]
+    assert told == sorted(told)
+    assert told[0] < told[-1] - 1
+    assert cuts[0].bytes < 0.8 * cuts[-1].bytes
+
+
+def test_what_is_drawn_of_a_prefix_is_what_decoders_draw(plain, plugins, toy, rasterizer):
+    method, model = plain
+    data, model = file_of(method, model), copy.deepcopy(model).eval()
+    order, camera = model.layers.order, toy.scene.test[0].camera
+    for cut, packets in [(number, cut.sections - 1) for number, cut in enumerate(ContainerReader(data).cuts, 1)]:
+        with torch.no_grad():
+            ours = model.prefix_of(order[:packets], *model.predicted())
+            theirs = prefix(plugins, data, cut).gaussians(camera, rasterizer)
+            images = [rasterizer.render(each, camera, RasterOptions()).image for each in (ours, theirs)]
+        assert torch.allclose(*images, atol=2e-3), cut
+
+
+def test_what_swells_prefixes_lowers_their_loss(plain, toy, rasterizer):
+    model = copy.deepcopy(plain[1]).eval()
+    draws = torch.Generator().manual_seed(0)
+    found = fitted_swell(model, toy.scene.train, rasterizer, toy.scene.background, 24, draws)
+    assert [len(row) for row in found] == [2, 4, 6]
+    errors = []
+    for swell in ((), found):
+        model.layers = replace(model.layers, swell=swell)
+        with torch.no_grad():
+            prefix = model.prefix_of(model.layers.order[:1], *model.predicted())
+        errors.append(squared_error(prefix, toy.scene.train, rasterizer, toy.scene.background))
+    assert errors[1] < errors[0]
+
+
+def test_a_resumed_training_has_the_same_layers(train, plain, tmp_path):
+    with pytest.raises(TrainingStopped):
+        train(directory=tmp_path, stop_after=83, context__kind="none")
+    _, resumed = train(directory=tmp_path, context__kind="none")
+    assert resumed.layers == plain[1].layers
+    assert resumed.digest() == plain[1].digest()
+
+
+def test_flat_trainings_have_no_layers(plugins):
+    names = short_training.firings(configured(plugins).stages()[0])
+    assert not {"draw some packets alone", "order packets"} & set(names)
+    found = short_training.firings(configured(plugins, **PROGRESSIVE).stages()[0])
+    assert found["draw some packets alone"][0] == 60
+    assert found["order packets"] == [80]
+
+
+def test_subsets_get_their_shares_of_the_bits_worth_most_first():
+    draws = torch.Generator().manual_seed(0)
+    worth, bits = torch.rand(5_000, generator=draws) - 0.1, 20 + 40 * torch.rand(5_000, generator=draws)
+    levels = torch.full((5_000,), 7)
+    found = split(worth, bits, bits, levels, [0.1, 0.3, 0.6])
+    shares = torch.stack([bits[found == subset].sum() for subset in range(3)]) / bits.sum()
+    assert torch.allclose(shares, torch.tensor([0.1, 0.3, 0.6]), atol=0.002)
+    ratios = (worth / bits).clamp_min(0)
+    assert ratios[found == 0].min() >= ratios[found == 1].max()
+    deep = split(worth.abs() + 1, bits, bits, torch.arange(5_000) % 2 * 9 + 3, [0.2, 0.8])
+    assert (deep[1::2] == 0).sum() == 0  # coarse cells first
+
+
+def test_what_is_known_without_refinements_is_within_their_cells():
+    draws = torch.Generator().manual_seed(0)
+    mean, steps = torch.randn(50, 22, generator=draws), 0.1 + torch.rand(50, 22, generator=draws)
+    k = torch.randint(-9, 10, (50, 22), generator=draws)
+    values = (mean + k * steps).requires_grad_()
+    layers = Layers.of_subsets(1, 2)
+    known = [
+        Known.after(layers.order[:packets], layers, mean.device).of(torch.zeros(50, dtype=torch.int64))
+        for packets in range(1, 5)
+    ]
+    forecast = Forecast(mean, torch.full_like(mean, 30.0), steps)
+    found = [as_known(values, forecast, each) for each in known]
+    for cell, drawn in zip((9, 3, 1), found, strict=False):
+        index = (drawn - mean) / steps
+        assert torch.allclose(index[:, 1:10], torch.round(k[:, 1:10] / cell) * cell, atol=1e-3)
+        assert torch.equal(drawn[:, 10:], mean[:, 10:])
+        assert torch.equal(drawn[:, :1], values[:, :1])
+    assert torch.allclose(found[3], values)
+    found[0].sum().backward()
+    assert (values.grad[:, :10] == 1).all()
+    assert (values.grad[:, 10:] == 0).all()
+    bits = packet_bits(values.detach(), forecast, torch.full((50,), 14.0), 2)
+    flat = packet_bits(values.detach(), forecast, torch.full((50,), 14.0), 0)
+    assert (bits["base"] < flat["base"]).all()
+    assert torch.allclose(bits["base"] + bits["fine"], flat["base"], rtol=1e-5)
+    assert torch.equal(bits["view"], flat["view"])
+
+
+def test_the_greedy_order_takes_what_is_worth_most_for_its_bits():
+    layers, worth = Layers.of_subsets(3, 1), {"base": 100.0, "fine": 30.0, "view": 8.0}
+
+    def error(packets):
+        return 1000 - sum(worth[kind] / (1 + 9 * subset * (kind == "base")) for subset, kind in packets)
+
+    order = greedy_order(layers, error, lambda packet: 10.0)
+    letters = [f"{subset + 1}{kind[0]}" for subset, kind in order]
+    assert " ".join(letters) == "1b 1f 2b 2f 1v 2v 3b 3f 3v"
+    check_order([Packet(subset, kind, 5) for subset, kind in order], 1)
+    assert admissible([], layers) == [(0, "base")]
+    assert len(admissible([(0, "base")], layers)) == 3
