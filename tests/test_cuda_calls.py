@@ -1,4 +1,4 @@
-"""Every operation on CUDA is called by its wrapper as its header says; stand-ins do for GPU and libraries."""
+"""Operations of plain C faces on CUDA are called by their wrappers as headers say; stand-ins do for GPU and library."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import ctypes
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -15,13 +14,11 @@ from sw_doctor.building import resolve_module
 from sw_doctor.declared_modules import declared_modules
 
 from splatwizard_core.plugins import load_plugins
-from splatwizard_native import AdamUpdate, NativeModule, offer_update
+from splatwizard_native import NativeModule
 from splatwizard_native import face as native_face
 from splatwizard_native.face import OPERATION, read_structs, structure
 
 STREAM = 4711
-RESULTS: dict[str, dict[str, int]] = {}
-"""What operations tell, where it is not 0."""
 DECLARED = [resolve_module(target) for target in declared_modules(load_plugins())]
 MODULES = [m.cuda for m in DECLARED if m.cuda is not None and m.cuda.face]
 
@@ -47,8 +44,6 @@ class Library:
             assert (handed.size, handed.abi) == (ctypes.sizeof(kind), native_face.ABI)
             assert (handed.device, handed.stream) == (0, STREAM)
             self.calls.setdefault(operation, []).append(handed)
-            for field, value in RESULTS.get(operation, {}).items():
-                setattr(reference._obj, field, value)
             return 0
 
         return call
@@ -58,7 +53,7 @@ class Library:
 def calls(monkeypatch) -> Iterator[dict[str, list[Any]]]:
     """The structs that were handed to the operations so far, by operation; all tensors say that they are on a GPU."""
     found: dict[str, list[Any]] = {}
-    monkeypatch.setattr(native_face, "current_stream", lambda device: STREAM + device)
+    monkeypatch.setattr(torch._C, "_cuda_getCurrentRawStream", lambda device: STREAM + device, raising=False)
     monkeypatch.setattr(NativeModule, "has_cuda", lambda self: True)
     monkeypatch.setattr(NativeModule, "library", property(lambda self: Library(self, found)))
     for name, told in {"is_cuda": True, "is_cpu": False, "device": torch.device("cuda", 0)}.items():
@@ -74,392 +69,6 @@ def calls(monkeypatch) -> Iterator[dict[str, list[Any]]]:
     for face, names in zip(faces, before, strict=True):
         for name in set(vars(face)) - set(names):
             delattr(face, name)
-
-
-def test_training(calls):
-    from splatwizard_native.fused.activations import activated
-    from splatwizard_native.fused.adam import AdamUpdate, adam_steps
-    from splatwizard_native.fused.photometric import photometric
-
-    x, y = rand(3, 40, 70, grad=True), rand(3, 40, 70)
-    total, _, _ = photometric(x, y, 0.2)
-    (grad,) = torch.autograd.grad(total, x, torch.ones(()))
-    assert grad.shape == x.shape
-    (first,) = calls["photometric_loss"]
-    assert (first.planes, first.height, first.width, first.valid, first.sum_count) == (3, 40, 70, False, 2 + 2 * 18)
-    assert (first.l1_weight, first.ssim_weight, first.offset) == (0.8, -0.2, 0.2)
-    (back,) = calls["photometric_loss_backward"]
-    assert (back.slopes, back.grad) == (first.slopes, grad.data_ptr())
-    with torch.no_grad():
-        photometric(x, y, 0.2, "valid")
-    assert (calls["photometric_loss"][1].slopes, calls["photometric_loss"][1].valid) == (None, True)
-
-    log_scales, logits = rand(5, 3, grad=True), rand(5, grad=True)
-    _, opacities = activated(log_scales, logits)
-    assert (calls["activate"][0].scale_count, calls["activate"][0].opacity_count) == (15, 5)
-    torch.autograd.grad(opacities, logits, rand(5))
-    (back,) = calls["activate_backward"]
-    assert (back.scale_count, back.opacity_count, back.by_scales, back.by_log_scales) == (0, 5, None, None)
-    assert back.opacities == opacities.data_ptr()
-
-    update = AdamUpdate(*(rand(4, 4) for _ in range(4)), lr=0.1, beta1=0.9, beta2=0.99, eps=1e-8, step=1)
-    version = update.param._version
-    adam_steps([update, update])
-    assert calls["adam"][0].count == 2
-    assert update.param._version > version
-
-
-def test_gaussians(calls):
-    from sw_gaussians.fast.sparse_adam import left_of
-    from sw_gaussians.fast.statistics import accumulate, accumulate_fragments
-    from sw_gaussians.surface_losses import _disagreement
-
-    from splatwizard_native import AdamUpdate
-
-    updates = [AdamUpdate(*(rand(6, width) for _ in range(4)), 0.1, 0.9, 0.99, 1e-8, 1) for width in (1, 4)]
-    updates.append(AdamUpdate(*(rand(7, 2) for _ in range(4)), 0.1, 0.9, 0.99, 1e-8, 1))
-    assert left_of(updates, torch.ones(6, dtype=torch.bool)) == updates[2:]
-    assert (calls["sparse_adam"][0].count, calls["sparse_adam"][0].rows) == (2, 6)
-
-    sums = SimpleNamespace(grad_accum=rand(5), denom=rand(5), max_radii2d=rand(5))
-    assert accumulate(sums, rand(5, 2), torch.ones(5, dtype=torch.int32))
-    assert calls["view_statistics"][0].rows == 5
-    assert accumulate_fragments(rand(5, 3), rand(5), rand(5), rand(5, 2), least_clear=0.5)
-    assert calls["fragment_statistics"][0].least_clear == 0.5
-    assert not accumulate_fragments(rand(5, 3), rand(5), rand(5).double(), rand(5, 2), least_clear=0.5)
-
-    depth, normals = rand(1, 4, 6, grad=True), rand(3, 4, 6, grad=True)
-    lens = SimpleNamespace(fx=1.0, fy=2.0, cx=3.0, cy=4.0)
-    found = _disagreement(depth, normals, rand(1, 4, 6), lens)
-    to_depth, to_normals = torch.autograd.grad(found, (depth, normals), rand(1, 4, 6))
-    (back,), (there,) = calls["disagreement_backward"], calls["disagreement"]
-    assert (back.depth, back.alpha) == (there.depth, there.alpha)
-    assert (back.height, back.width, back.fx, back.fy, back.cx, back.cy) == (4, 6, 1, 2, 3, 4)
-    assert (back.to_depth, back.to_normals) == (to_depth.data_ptr(), to_normals.data_ptr())
-
-
-class ChannelNetworks:
-    """Networks of channels that say zero."""
-
-    context = True
-
-    def __init__(self, features: int) -> None:
-        self.columns = torch.zeros(3, features, dtype=torch.int32)
-
-    def check_for(self, features, device):
-        assert self.columns.shape[1] == features
-
-    def packed(self, parameters):
-        return torch.cat([each.flatten() for each in parameters])
-
-    def unpacked(self, packed, factor):
-        return [packed * factor]
-
-    def forward(self, packed, inputs):
-        return inputs, inputs.new_zeros(len(inputs), 3 * self.columns.shape[1])
-
-    def backward(self, packed, inputs, hidden, slopes):
-        return torch.zeros_like(inputs), torch.zeros_like(packed)
-
-
-def test_hac(calls):
-    from sw_hac.fast.predicted_bits import MaskKind, Predicted, mixture_bits
-
-    features, k, count = 4, 2, 7
-    numbers = features + 6 + 3 * k
-    width = 2 * numbers + features
-    x, outputs, steps = rand(count, numbers, grad=True), rand(count, width, grad=True), rand(count, 3, grad=True)
-    masks, weights = rand(count, k, grad=True), rand(5, grad=True)
-    predicted = Predicted(rand(width), 0.5, 1e-6, 1e-9, 0.05, MaskKind.GATED)
-    given = (x, outputs, steps, masks, rand(count), predicted)
-    bits, _ = mixture_bits(*given, ChannelNetworks(features), (weights,))
-    torch.autograd.grad(bits, (x, outputs, steps, masks, weights), torch.ones(()))
-    (first,), (inputs,), (back,) = (calls[name] for name in ("mixture_bits", "channel_inputs", "channel_slopes"))
-    assert (first.count, first.numbers, first.width, first.features, first.k) == (count, numbers, width, features, k)
-    assert (first.kind, first.second is None, first.to_second is None) == (1, False, False)
-    assert (inputs.columns, back.columns) == (20, 20)
-    assert back.by_x == first.to_x
-    bits, _ = mixture_bits(*given)
-    torch.autograd.grad(bits, x, torch.ones(()))
-    assert (calls["mixture_bits"][1].second, calls["channel_slopes"][1].by_inputs) == (None, None)
-
-
-def test_anchors(calls, monkeypatch):
-    from sw_anchors.anchors import two_layers
-    from sw_anchors.fast import networks, rows, sample_bits, spawn
-
-    n, k, inputs = 5, 4, 8
-    monkeypatch.setattr(networks, "fits_kernel", lambda *_: True)
-    generator = torch.Generator().manual_seed(0)
-    three = tuple(two_layers(inputs + 4, 6, outputs * k, generator) for outputs in (1, 7, 3))
-    parameters = networks.parameters_of(three)
-    positions, features = rand(n, 3), rand(n, inputs + 9, grad=True)
-    outputs = networks.network_outputs(rand(3), positions, features[:, :inputs], three)
-    assert [each.shape for each in outputs] == [(n, k), (n, 7 * k), (n, 3 * k)]
-    slopes = [torch.ones_like(each) for each in outputs]
-    grads = torch.autograd.grad(outputs, [features, *parameters], slopes)
-    assert [grad.shape for grad in grads[1:]] == [parameter.shape for parameter in parameters]
-    (first,), (back,), (sizes,) = (
-        calls[name] for name in ("view_networks", "view_networks_backward", "view_networks_sizes")
-    )
-    assert (first.n, first.inputs, first.units, first.k, first.geometry_count) == (n, inputs, 6, k, 7 * k)
-    assert (first.feature_row, back.total % 4, sizes.n) == (inputs + 9, 0, n)
-    assert back.total >= sum(parameter.numel() for parameter in parameters)
-
-    alpha, geometry, color = (each.detach().requires_grad_() for each in outputs)
-    offsets, scales, masks = rand(n, k * 3, grad=True), rand(n, 6, grad=True), rand(n, k, grad=True)
-    drawn = torch.tensor([0, 3, 7])
-    given = (alpha, geometry, color, positions, offsets.view(n, k, 3), scales, masks)
-    found = spawn._Gaussians.apply(drawn, *given)
-    learning = alpha, geometry, color, offsets, scales, masks
-    grads = torch.autograd.grad(found, learning, [torch.ones_like(each) for each in found])
-    assert [grad.shape for grad in grads] == [each.shape for each in learning]
-    (back,) = calls["spawn_backward"]
-    assert (back.n, back.k, back.count, back.to_positions, back.ordered) == (n, k, 3, None, False)
-    assert calls["spawn"][0].offset_row == 3 * k
-
-    numbers = inputs + 6 + 3 * k
-    values, mean, scale, steps = (rand(n, columns, grad=True) for columns in (numbers, numbers, numbers, 3))
-    bits, _ = sample_bits.bits_of(values, mean, scale, steps, masks, rand(n), 1e-6, 1e-9)
-    torch.autograd.grad(bits, values, torch.ones(()))
-    assert calls["sample_bits"][0].numbers == numbers
-
-    index = torch.tensor([1, 4])
-    rows.load_rows(index, [positions, scales.detach()], [rand(3, 3), rand(2, 6)])
-    taken = rows.take_rows(index, positions, features[:, :inputs])
-    assert [each.shape for each in taken] == [(2, 3), (2, inputs)]
-    (put,) = torch.autograd.grad(taken[1], features, rand(2, inputs))
-    assert put.shape == features.shape
-    rows.add_rows(index, [rand(2, 6)], [scales.detach()])
-    assert [(call.way, call.tensors, call.count) for call in calls["copy_rows"]] == [
-        (0, 2, 2),
-        (0, 2, 2),
-        (1, 1, 2),
-        (2, 1, 2),
-    ]
-    with pytest.raises(RuntimeError, match="2 rows of"):
-        rows.add_rows(index, [rand(2, 5)], [scales.detach()])
-
-    of_rows = [rand(n, columns, grad=True) for columns in (inputs, 6, 3 * k, k)]
-    each_step = rand(n, 3, grad=True)
-    values, groups, masks, _ = rows.noisy_rows(
-        of_rows, rand(n, 1), torch.tensor(4.0), rand(n * numbers), each_step, 0.01
-    )
-    torch.autograd.grad(
-        (values, groups[0], masks), [*of_rows, each_step], [torch.ones_like(t) for t in (values, groups[0], masks)]
-    )
-    (back,), (there,) = calls["row_values_backward"], calls["row_values"]
-    assert (there.threshold, back.steps) == (0.01, each_step.data_ptr())
-    assert (back.count, back.width, back.k, back.step_rows) == (n, inputs, k, n)
-    assert (list(back.by_rows), back.by_scales) == ([numbers, inputs, 0, 0, k], None)
-
-
-LEVELS = [4.0, 8.0], [5, 9], [0, 216], [1, 0], 9
-"""A dense and a hashed level over three axes, of 216 and 512 entries."""
-
-
-def test_grids(calls):
-    from sw_codecs.fast import kernel_operations as codecs
-
-    x, values, gradient = rand(5, 3), rand(728, 2), rand(5, 4)
-    assert codecs.lookup(x, values, *LEVELS).shape == (5, 4)
-    assert codecs.backward(x, gradient, 728, 2, *LEVELS).shape == (728, 2)
-    codecs.backward(x, gradient, 728, 2, *LEVELS, largest=torch.ones(()))
-    (lookup,), (plain, ordered) = calls["grid_lookup"], calls["grid_backward"]
-    assert (lookup.count, lookup.axes, lookup.entries, lookup.features, lookup.levels) == (5, 3, 728, 2, 2)
-    assert (list(lookup.scales[:3]), list(lookup.dense[:3])) == ([4, 8, 0], [1, 0, 0])
-    assert (plain.largest, plain.sums, ordered.sums is None, ordered.largest is None) == (None, None, False, False)
-    codecs.signs_lookup(x, (0, 1, 2), values, rand(5, 7), 3, *LEVELS)
-    codecs.signs_backward(x, (0, 2), values, rand(5, 7), 3, [4.0], [5], [0], [1], 9, largest=torch.ones(()))
-    (lookup,), (back,) = calls["signs_lookup"], calls["signs_backward"]
-    assert (lookup.row, lookup.first, lookup.dimensions, back.dimensions, list(back.axes)) == (7, 3, 3, 2, [0, 2, 0])
-
-
-@pytest.mark.parametrize("deterministic", [False, True])
-def test_planes(calls, monkeypatch, deterministic):
-    from sw_cat_3dgs.fast import plane_kernels
-
-    monkeypatch.setattr(torch, "are_deterministic_algorithms_enabled", lambda: deterministic)
-    planes = [rand(3, 4, 8, 9), rand(3, 4, 16, 18)]
-    assert plane_kernels.fit_kernels(planes)
-    sums, to_planes = plane_kernels.plane_bits(planes, rand(3, 1058), planes_learn=True)
-    assert (sums.shape, [each.shape for each in to_planes]) == ((3, 1060), [plane.shape for plane in planes])
-    (call,), (sizes,) = calls["plane_bits"], calls["plane_bits_sizes"]
-    assert (sizes.scales, sizes.channels) == (2, 4)
-    assert (call.scales, call.orientations, call.channels, call.parts) == (2, 3, 4, 0)
-    assert (list(call.heights), list(call.widths)) == ([8, 16, 0, 0], [9, 18, 0, 0])
-    assert list(call.ordered_counts) == ([3 * 192 * 9, 3 * 192 * 36, 0, 0] if deterministic else [0] * 4)
-    assert plane_kernels.plane_bits(planes, rand(3, 1058), planes_learn=False)[1] == []
-    assert list(calls["plane_bits"][1].to_planes) == [None] * 4
-
-    cells, weights = torch.zeros(7, 2, 3, 4, dtype=torch.int32), rand(7, 2, 3, 4)
-    features = plane_kernels.sampled(cells, weights, planes, 16.0)
-    assert features.shape == (7, 2 * 3 * 4)
-    found = plane_kernels.sampled_backward(cells, weights, features, planes)
-    assert [each.shape for each in found] == [plane.shape for plane in planes]
-    (call,), (back,) = calls["triplane_lookup"], calls["triplane_backward"]
-    assert (call.count, call.scales, call.channels, call.width, call.gain) == (7, 2, 4, 24, 16)
-    assert list(call.places) == list(back.places) == [72, 288, 0, 0]
-    assert (back.largest is None, back.tables[0] is None, back.sums[0] is None) == (
-        not deterministic, deterministic, not deterministic
-    )  # fmt: skip
-    with pytest.raises(RuntimeError, match=r"planes must be \[3,4,H,W\]"):
-        plane_kernels.sampled(cells, weights, [planes[0], rand(3, 5, 2, 2)], 0.0)
-
-
-@pytest.fixture
-def drawn(calls, monkeypatch):
-    """The calls, where every picture has room for its 7 splats and 20 pairs."""
-    from sw_rasterizers import cuda
-
-    monkeypatch.setattr(cuda, "_MAILBOXES", SimpleNamespace(address=lambda _: 64))
-    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
-    monkeypatch.setattr(cuda, "_plan", cuda._plan.__wrapped__)
-    monkeypatch.setattr(cuda, "_row_length", cuda._row_length.__wrapped__)
-    monkeypatch.setitem(RESULTS, "plan_render", {"splat_bytes": 640, "scratch_bytes": 128, "list_bytes": 256})
-    monkeypatch.setitem(RESULTS, "plan_sums", {"row_length": 9, "blend_bytes": 64, "score_bytes": 64})
-    monkeypatch.setitem(RESULTS, "render", {"complete": True, "used": 7, "pairs": 20, "kept_in": 1, "seen": 8})
-    return calls
-
-
-def view_of(flags: int = 4, **more: Any) -> Any:
-    from sw_rasterizers.call import Call, Flag
-
-    camera = [1.0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 2, 30, 30, 16, 12, 0.2, 100]
-    return Call(camera, 32, 24, 1, 1.0, 0.3, Flag(flags), **more)
-
-
-def tensors_of(n: int = 8, columns: int = 3) -> dict[str, Any]:
-    shapes = {"means": (n, 3), "opacities": (n,), "scales": (n, columns), "quats": (n, 4), "sh_dc": (n, 1, 3),
-              "sh_rest": (n, 3, 3)}  # fmt: skip
-    return {name: rand(*shape, grad=True) for name, shape in shapes.items()}
-
-
-def test_pictures(drawn):
-    from splatwizard_core.api import GradBuffer
-    from sw_rasterizers import ops
-
-    call, tensors = view_of(background=rand(3), grad2d=GradBuffer(), flags=4 | 512), tensors_of()
-    update = AdamUpdate(tensors["sh_rest"], *(rand(8, 3, 3) for _ in range(3)), 0.1, 0.9, 0.99, 1e-8, 2)
-    offer_update(tensors["sh_rest"], update)
-    image, radii, alpha, median = ops.rasterize(call, tensors)
-    assert (image.shape, radii.shape, alpha.shape, median) == ((3, 24, 32), (8,), (1, 24, 32), None)
-    assert call.counts == [8, 20, 0, 0, 0]
-    version = tensors["sh_rest"]._version
-    grads = torch.autograd.grad(
-        (image, alpha), [*tensors.values()], [torch.ones_like(image), torch.ones_like(alpha)], allow_unused=True
-    )
-    shapes = [None if grad is None else grad.shape for grad in grads]
-    assert shapes == [*(x.shape for x in list(tensors.values())[:5]), None]
-    assert tensors["sh_rest"]._version > version
-    (plan,), (render,), (blend,), (project,) = (
-        drawn[name] for name in ("plan_render", "render", "blend_backward", "project_backward")
-    )
-    assert (render.count, render.shapes, render.rest_rows, render.color_channels, render.channels) == (8, 8, 3, 3, 3)
-    assert (render.splat_bytes, render.list_bytes, render.mailbox, render.flags & 1024) == (640, 256, 64, 1024)
-    assert (plan.room, plan.splat_room) == (render.room, render.splat_room)
-    assert (blend.pair_splats, blend.lists, blend.used, blend.pairs) == (render.second, render.lists, 7, 20)
-    assert (blend.color_channels, blend.count, blend.row_length, blend.by_median) == (3, 8, 9, None)
-    assert (project.rows, project.drawn, project.maps) == (blend.rows, render.drawn, False)
-    assert (project.rest_exp_avg, project.of_sh_rest, project.dc_exp_avg) == (update.exp_avg.data_ptr(), None, None)
-    assert list(project.rest_rates)[:4] == pytest.approx([0.1 / (1 - 0.9**2), 0.1, 0.99, 0.01])
-    assert call.grad2d.value.shape == (8, 2)
-
-    with torch.no_grad():
-        image, *_ = ops.rasterize(view_of(flags=4 | 8192 | 32768), tensors)
-    assert (image.dtype, drawn["render"][1].levels) == (torch.uint8, image.data_ptr())
-    assert (drawn["render"][1].drawn, drawn["render"][1].image) == (None, None)
-
-
-def test_a_picture_without_room_is_gone_on_with_and_one_of_too_many_pairs_refused(drawn, monkeypatch):
-    from sw_rasterizers import cuda, ops
-
-    monkeypatch.setattr(cuda._Recent, "pairs", 0)
-    monkeypatch.setitem(RESULTS, "render", {"used": 7, "pairs": 5000})
-    asked = []
-    whole = cuda_face().render
-
-    def render(**given):
-        asked.append((given["room"] if "room" in given else given["first"].numel(), given["projected"]))
-        found = whole(**given)
-        found.complete = len(asked) > 1
-        return found
-
-    monkeypatch.setattr(cuda_face(), "render", render)
-    tensors = tensors_of()
-    with torch.no_grad():
-        ops.rasterize(view_of(), tensors)
-        assert asked[0] == (1024, False)
-        assert asked[1][0] >= 5000
-        assert asked[1][1]
-        assert drawn["render"][0].splats == drawn["render"][1].splats
-        monkeypatch.setenv(cuda.LIMIT, "4999")
-        with pytest.raises(RuntimeError, match=r"^sw_rasterizers: 5000 splat-tile pairs are more than 4999: "):
-            ops.rasterize(view_of(), tensors)
-
-
-def cuda_face():
-    from sw_rasterizers import cuda_face
-
-    return cuda_face
-
-
-def test_surfels(drawn):
-    from sw_rasterizers.call import Flag
-    from sw_rasterizers.surfel import _draw
-
-    call, tensors = view_of(flags=4 | 512 | int(Flag.WITH_MAPS)), tensors_of(columns=2)
-    image, _, _, maps = _draw(call, tensors)
-    assert (image.shape, maps.shape) == ((3, 24, 32), (7, 24, 32))
-    grads = torch.autograd.grad((image, maps), list(tensors.values()), [torch.ones_like(image), torch.ones_like(maps)])
-    assert [grad.shape for grad in grads] == [x.shape for x in tensors.values()]
-    assert drawn["render"][0].scale_columns == 2
-    assert (drawn["project_backward"][0].maps, drawn["plan_sums"][0].maps) == (True, True)
-    assert drawn["blend_backward"][0].by_alpha is None
-
-
-@pytest.mark.parametrize("ordered", [0, 131072])
-def test_scores(drawn, ordered):
-    from splatwizard_core.api import RasterOptions, ScoreSpec
-    from sw_rasterizers.scoring import _add_on_cuda
-
-    tensors = {name: x.detach() for name, x in tensors_of().items()}
-    weight = rand(24, 32)
-    opt = RasterOptions(scores=(ScoreSpec("h", "hits"), ScoreSpec("g", "blend", pixel_weight=weight)), fisher=True)
-    totals = SimpleNamespace(scores=rand(2, 8).double(), fisher=rand(8, 21).double())
-    _add_on_cuda(
-        {name: tensors.get(name) for name in (*tensors, "cov3d", "sh", "colors")},
-        view_of(4 | ordered),
-        opt.scores,
-        totals,
-    )
-    (scores,), (fisher,), (render,) = (drawn[name] for name in ("accumulate_scores", "accumulate_fisher", "render"))
-    assert (scores.scores, list(scores.kinds[:2]), scores.weights[1]) == (2, [0, 3], weight.data_ptr())
-    assert (scores.weights[0], scores.totals[1]) == (None, totals.scores[1].data_ptr())
-    assert (fisher.splats, fisher.drawn, fisher.used, fisher.count) == (7, render.drawn, 7, 8)
-    assert (scores.scratch is not None) == bool(ordered)
-    assert render.flags == 4 | ordered | 1024 | 65536
-
-
-def test_shared_colours_and_radii(drawn):
-    from splatwizard_core.api import SH
-    from sw_rasterizers import ops
-    from sw_rasterizers.shared_colors import shared_colors
-
-    sh = SH(dc=rand(300, 1, 3, grad=True), codebook=rand(5, 3, 3, grad=True), active_degree=1)
-    segments = SimpleNamespace(
-        indices=torch.zeros(300, dtype=torch.int64), order=torch.arange(300), offsets=torch.zeros(6, dtype=torch.int64)
-    )
-    means = rand(300, 3, grad=True)
-    colors = shared_colors(sh, segments, means, rand(3), clamp=True)
-    grads = torch.autograd.grad(colors, (sh.codebook, sh.dc, means), torch.ones_like(colors))
-    assert [grad.shape for grad in grads] == [(5, 3, 3), (300, 1, 3), (300, 3)]
-    (back,), (shade,) = drawn["shade_shared_backward"], drawn["shade_shared"]
-    assert shade.rows == back.rows
-    assert (back.count, back.entries, back.coefficients, back.runs, back.clamp) == (300, 5, 3, 3, 1)
-    camera = SimpleNamespace(pose=[0.0] * 12, fx=1, fy=1, cx=0, cy=0, near=0.1, far=9, width=4, height=3)
-    assert ops.visible_radii(rand(8, 3), rand(8, 3), rand(8, 4), None, None, camera).shape == (8,)
-    assert drawn["visible_radii"][0].scale_columns == 3
 
 
 def test_wisp(calls, monkeypatch):

@@ -27,12 +27,9 @@ import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 DECLARES = re.compile(r"^(\w+) = NativeModule\(", re.MULTILINE)
-Module = Any
-"""A `splatwizard_native.NativeModule`, which is imported once its folder is on the path."""
 EPOCH = "1577836800"  # 2020-01-01: zip files know no time before 1980, and hatchling takes one
 
 
@@ -46,40 +43,25 @@ def packages(names: Sequence[str]) -> list[Path]:
     return [folder for folder in found if not names or folder.name in names]
 
 
-def declared(package: Path) -> Iterator[Module]:
-    """The native modules of a package, which has to be on the path."""
-    from splatwizard_native import NativeModule
+def compiled(package: Path, machine: str, into: Path) -> Iterator[Path]:
+    """Compile the modules with a plain C face of a package; put each into its place below `into`, a folder like src."""
+    from splatwizard_native import NativeModule, Toolchain
 
     for path in sorted((package / "src").rglob("*.py")):
         for name in DECLARES.findall(path.read_text(encoding="utf-8")):
             relative = path.relative_to(package / "src")
             module = getattr(importlib.import_module(".".join(relative.with_suffix("").parts)), name)
-            if isinstance(module, NativeModule):
-                yield module
-
-
-def placed(module: Module, machine: str, folder: Path) -> Path:
-    """Compile a module into a `prebuilt` folder, with the facts beside it that the loader looks for."""
-    from splatwizard_native import Toolchain
-
-    with tempfile.TemporaryDirectory() as scratch:
-        tools = Toolchain()
-        built = module.build(march=machine, folder=Path(scratch), tools=tools)
-        told = json.loads(built.with_suffix(".json").read_text(encoding="utf-8"))
-        place = folder / module.prebuilt_name("portable")
-        place.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(built, place)
-    facts = {"sha256": hashlib.sha256(place.read_bytes()).hexdigest(), "compiler": tools.version()}
-    facts |= {"architectures": told["architectures"]} if told["architectures"] else {}
-    place.with_suffix(".json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
-    return place
-
-
-def compiled(package: Path, machine: str, into: Path) -> Iterator[Path]:
-    """Compile the modules of a package for the CPU; put each into its place below `into`, a folder like src."""
-    for module in declared(package):
-        if not module.cuda_sources:
-            yield placed(module, machine, into / Path(*module.package.split(".")) / "prebuilt")
+            if not isinstance(module, NativeModule) or not module.face or module.cuda_sources:
+                continue
+            tools = Toolchain()
+            with tempfile.TemporaryDirectory() as scratch:
+                built = module.build(march=machine, folder=Path(scratch), tools=tools)
+                place = into / Path(*module.package.split(".")) / "prebuilt" / module.prebuilt_name("portable")
+                place.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(built, place)
+            facts = {"sha256": hashlib.sha256(place.read_bytes()).hexdigest(), "compiler": tools.version()}
+            place.with_suffix(".json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
+            yield place
 
 
 def platform_of(libraries: Sequence[Path], machine: str) -> str:
@@ -94,20 +76,14 @@ def build(package: Path, machine: str, out: Path) -> Path:
         copy = Path(scratch) / package.name
         shutil.copytree(package, copy, ignore=shutil.ignore_patterns("__pycache__", "prebuilt", "tests"))
         libraries = list(compiled(package, machine, copy / "src"))
-        return packed(copy, platform_of(libraries, machine) if libraries else "", out)
-
-
-def packed(project: Path, tag: str, out: Path) -> Path:
-    """Build the wheel of a project for a platform; empty: for any. Returns its path."""
-    environment = {**os.environ, "SOURCE_DATE_EPOCH": os.environ.get("SOURCE_DATE_EPOCH", EPOCH)}
-    if tag:
-        environment["SPLATWIZARD_WHEEL_PLATFORM"] = tag
-    with tempfile.TemporaryDirectory() as scratch:
-        command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", scratch]
-        done = subprocess.run(command, cwd=project, env=environment, capture_output=True, text=True, check=False)
+        environment = {**os.environ, "SOURCE_DATE_EPOCH": os.environ.get("SOURCE_DATE_EPOCH", EPOCH)}
+        if libraries:
+            environment["SPLATWIZARD_WHEEL_PLATFORM"] = platform_of(libraries, machine)
+        command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(Path(scratch) / "wheel")]
+        done = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True, check=False)
         if done.returncode != 0:
-            sys.exit(f"{project.name}: {done.stdout}{done.stderr}")
-        (wheel,) = Path(scratch).iterdir()
+            sys.exit(f"{package.name}: {done.stdout}{done.stderr}")
+        (wheel,) = (Path(scratch) / "wheel").iterdir()
         return Path(shutil.copyfile(wheel, out / wheel.name))
 
 

@@ -3,7 +3,6 @@
 import ctypes
 import hashlib
 import itertools
-import re
 import shutil
 from pathlib import Path
 
@@ -17,7 +16,6 @@ needs_compiler = pytest.mark.skipif(
 
 
 packages = itertools.count()
-SHOWN = 'extern "C" __attribute__((visibility("default")))'
 
 
 class Package:
@@ -27,7 +25,7 @@ class Package:
         self.folder, self.calls = folder, calls
         self.write("__init__.py", "")
         self.write("value.h", "#define VALUE 41\n")
-        self.write("answer.cpp", f'#include "value.h"\n{SHOWN} int answer() {{ return VALUE + 1; }}\n')
+        self.write("answer.cpp", '#include "value.h"\nextern "C" int answer() { return VALUE + 1; }\n')
 
     def write(self, name: str, text: str) -> None:
         (self.folder / name).write_text(text)
@@ -39,9 +37,7 @@ class Package:
 
     @property
     def compilations(self) -> int:
-        """Sources of the package that were compiled; the build adds one of its own."""
-        text = self.calls.read_text() if self.calls.exists() else ""
-        return len(re.findall(rf" -c {self.folder}/[^/ ]+ ", text))
+        return self.calls.read_text().count(" -c ") if self.calls.exists() else 0
 
     @property
     def links(self) -> int:

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from native_package import SHOWN, call, needs_compiler
+from native_package import call, needs_compiler
 
 from splatwizard_native import NativeModule, cuda_toolkit, toolchain
 
@@ -41,7 +41,7 @@ int level() {
 def test_a_portable_build_runs_the_best_kernel_that_this_cpu_has(package):
     package.write("level.h", LEVEL_H)
     package.write("level.cpp", LEVEL_CPP)
-    package.write("answer.cpp", f'#include "level.h"\n{SHOWN} int answer() {{ return SW_SELECT(level)(); }}\n')
+    package.write("answer.cpp", '#include "level.h"\nextern "C" int answer() { return SW_SELECT(level)(); }\n')
     module = package.module(kernels=("level.cpp",))
     library = module.build(march="portable", folder=module.prebuilt_folder)
     assert package.compilations == 4
@@ -61,32 +61,36 @@ def test_a_portable_build_runs_the_best_kernel_that_this_cpu_has(package):
 def test_kernels_see_their_namespace_and_no_torch_header(package):
     package.write("level.h", LEVEL_H)
     package.write("level.cpp", "#if __has_include(<torch/library.h>)\n#error torch\n#endif\n" + LEVEL_CPP)
-    package.write("answer.cpp", f'#include "level.h"\n{SHOWN} int answer() {{ return SW_SELECT(level)(); }}\n')
+    package.write("answer.cpp", '#include "level.h"\nextern "C" int answer() { return SW_SELECT(level)(); }\n')
     assert call(package.module(kernels=("level.cpp",)).build()) in (2, 3, 4)
 
 
-def fake_machine(package, monkeypatch, **fields) -> NativeModule:
-    """A module on a machine of which everything that counts is known."""
+def fake_cuda(package, monkeypatch) -> NativeModule:
+    """A module with a kernel of every sort, on a machine of which everything that counts is known."""
     import torch
 
-    for name in ("fill.cu", "face.cpp", "level.cpp"):
+    for name in ("fill.cu", "binding.cpp", "level.cpp"):
         package.write(name, "")
     monkeypatch.setenv("CXX", "g++ -v1")
-    monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "8.0 9.0a 12.0+PTX")
+    monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "8.0 9.0a")
+    monkeypatch.setattr(torch, "__version__", "2.99.0")
     monkeypatch.setattr(torch.version, "cuda", "13.0")
+    monkeypatch.setattr(torch._C, "_GLIBCXX_USE_CXX11_ABI", True)
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.setattr(platform, "machine", lambda: "x86_64")
     monkeypatch.setattr(toolchain, "cpu_identity", lambda: "a CPU")
     monkeypatch.setattr(cuda_toolkit, "find_nvcc", lambda: "/opt/cuda/bin/nvcc")
     monkeypatch.setattr(cuda_toolkit, "nvcc_version", lambda _: (13, 2))
-    return package.module(sources=("answer.cpp", "face.cpp"), cflags=("-fx", "-fy"), **fields)
+    return package.module(
+        sources=("answer.cpp", "binding.cpp"), kernels=("level.cpp",), cuda_sources=("fill.cu",), cflags=("-fx", "-fy")
+    )
 
 
 @pytest.mark.parametrize("march", ["native", "portable"])
-@pytest.mark.parametrize("on_gpu", [False, True], ids=["cpu", "gpu"])
-def test_the_command_lines_of_a_build(package, monkeypatch, tmp_path, march, on_gpu):
-    fields = {"cuda_sources": ("fill.cu",)} if on_gpu else {"kernels": ("level.cpp",)}
-    module = fake_machine(package, monkeypatch, **fields)
+def test_the_command_lines_of_a_build(package, monkeypatch, tmp_path, march):
+    import torch
+
+    module = fake_cuda(package, monkeypatch)
     run: list[list[str]] = []
 
     def compiler(command, **_):
@@ -103,8 +107,9 @@ def test_the_command_lines_of_a_build(package, monkeypatch, tmp_path, march, on_
     library = module.build(march=march, tools=toolchain.Toolchain(1))
     link = run.pop()
     scratch = Path(link[link.index("-o") + 1]).parent
+    lib, include = Path(torch.__file__).parent / "lib", Path(torch.__file__).parent / "include"
     home = cuda_toolkit.root_of("/opt/cuda/bin/nvcc")
-    common = "-std=c++20 -O3 -fPIC -fvisibility=hidden -fopenmp-simd -pthread"
+    common = "-std=c++20 -O3 -fPIC -D_GLIBCXX_USE_CXX11_ABI=1 -fopenmp -DSW_WITH_CUDA"
     if march == "native":
         levels = {"arch_native": "-march=native -mprefer-vector-width=512"}
     else:
@@ -115,59 +120,45 @@ def test_the_command_lines_of_a_build(package, monkeypatch, tmp_path, march, on_
             "arch_v4": "-march=x86-64-v4 -mprefer-vector-width=512",
         }
     shared = f"-isystem {toolchain.SHARED_INCLUDE}"
-    include = f"{shared} -isystem {home}/include" if on_gpu else shared
+    headers = f"{shared} -isystem {include} -isystem {include}/torch/csrc/api/include -isystem {home}/include"
 
-    def compiled(compiler: str, source: str, name: str, folder: Path = package.folder) -> str:
-        return f"{compiler} -MD -MF {scratch}/{name}.o.d -c {folder}/{source} -o {scratch}/{name}.o"
+    def compiled(compiler: str, source: str, name: str) -> str:
+        return f"{compiler} -MD -MF {scratch}/{name}.o.d -c {package.folder}/{source} -o {scratch}/{name}.o"
 
-    behind = f"g++ -v1 {common} {next(iter(levels.values()))} {include} -fx -fy"
-    expected = [compiled(behind, "answer.cpp", "0"), compiled(behind, "face.cpp", "1")]
-    expected.append(compiled(behind, "answer.cpp", "2", scratch))  # what the library tells of itself
-    names = ["0", "1", "2"]
-    if on_gpu:
-        nvcc = "/opt/cuda/bin/nvcc -std=c++20 -O3 -Xcompiler -fPIC"
-        nvcc += " -gencode=arch=compute_120,code=sm_120 -gencode=arch=compute_120,code=compute_120"
-        nvcc += f" -gencode=arch=compute_80,code=sm_80 -gencode=arch=compute_90a,code=sm_90a {shared}"
-        expected.append(compiled(nvcc, "fill.cu", "cuda-0"))
-        names.append("cuda-0")
-    else:
-        for arch, flags in levels.items():
-            kernel = f"g++ -v1 {common} {shared} -fx -fy {flags} -DSW_ARCH={arch}"
-            expected.append(compiled(kernel, "level.cpp", f"{arch}-0"))
-            names.append(f"{arch}-0")
+    binding = f"g++ -v1 {common} {next(iter(levels.values()))} {headers} -fx -fy"
+    expected = [compiled(binding, "answer.cpp", "0"), compiled(binding, "binding.cpp", "1")]
+    for arch, flags in levels.items():
+        kernel = f"g++ -v1 {common} {shared} -fx -fy {flags} -DSW_ARCH={arch}"
+        expected.append(compiled(kernel, "level.cpp", f"{arch}-0"))
+    nvcc = "/opt/cuda/bin/nvcc -std=c++20 -O3 -Xcompiler -fPIC -DSW_WITH_CUDA -gencode=arch=compute_80,code=sm_80"
+    expected.append(compiled(f"{nvcc} -gencode=arch=compute_90a,code=sm_90a {shared}", "fill.cu", "cuda-0"))
     assert sorted(map(shlex.join, run)) == sorted(expected)
-    objects = " ".join(f"{scratch}/{name}.o" for name in names)
-    script = f"-Wl,--version-script={scratch}/shown"
-    libraries = f"-pthread -L {home}/lib64 -lcudart_static -ldl -lrt" if on_gpu else "-pthread"
-    if march == "native":
-        runtime = "".join(f"{path} " for path in toolchain.runtime_libraries())
-        libraries = f"{runtime}{libraries}{f' {script}' * on_gpu}"
-    else:
-        libraries = f"{libraries} {script} -static-libstdc++ -static-libgcc -Wl,-s"
-    assert shlex.join(link) == f"g++ -v1 -shared {objects} -o {scratch}/{library.name} {libraries}"
+    objects = " ".join(f"{scratch}/{name}.o" for name in ("0", "1", *(f"{arch}-0" for arch in levels), "cuda-0"))
+    runtime = "".join(f"{path} " for path in toolchain.runtime_libraries())
+    assert shlex.join(link) == (
+        f"g++ -v1 -shared {objects} -o {scratch}/{library.name} {runtime}-fopenmp -L {lib} -ltorch -ltorch_cpu -lc10 "
+        f"-ltorch_cuda -lc10_cuda -L {home}/lib64 -lcudart"
+    )
     facts = json.loads(library.with_suffix(".json").read_text())
-    held = ["12.0+PTX", "8.0", "9.0a"] if on_gpu else []
-    assert (facts["march"], facts["architectures"], facts["compiler"]) == (march, held, "g++ 99")
+    assert (facts["march"], facts["architectures"], facts["compiler"]) == (march, ["8.0", "9.0a"], "g++ 99")
 
 
-@pytest.mark.parametrize("on_gpu", [False, True], ids=["cpu", "gpu"])
-def test_the_names_of_builds_follow_from_sources_flags_and_machine(package, monkeypatch, on_gpu):
-    """As of every earlier release: else a library that ships in a wheel is not found, and every user compiles again."""
-    module = fake_machine(package, monkeypatch, **({"cuda_sources": ("fill.cu",)} if on_gpu else {}))
-    common = ("-std=c++20", "-O3", "-fPIC", "-fvisibility=hidden", "-fopenmp-simd", "-pthread")
+def test_the_cache_key_is_that_of_every_earlier_release(package, monkeypatch):
+    """Else a prebuilt library that ships in a wheel is not found, and every user compiles again."""
+    module = fake_cuda(package, monkeypatch)
+    common = ("-std=c++20", "-O3", "-fPIC", "-D_GLIBCXX_USE_CXX11_ABI=1", "-fopenmp")
     levels = {"arch_native": ("-march=native", "-mprefer-vector-width=512")}
-    facts: list[object] = ["answer", "ABI 1", common, platform.system(), "x86_64", "native", levels, "a CPU"]
-    facts += [("-fx", "-fy"), (), *(["12.0+PTX", "8.0", "9.0a"] if on_gpu else [])]
-    files = [package.folder / name for name in ("answer.cpp", "face.cpp", *(["fill.cu"] if on_gpu else []))]
-    files += [package.folder / "value.h", *sorted(toolchain.SHARED_INCLUDE.rglob("*.h"))]
-
-    def digest_of(facts: list[object]) -> str:
-        digest = hashlib.sha256(repr(facts).encode())
+    facts: list[object] = ["answer", "2.99.0", common, platform.system(), "x86_64", "native", levels, "a CPU"]
+    facts += [("-fx", "-fy"), ()]
+    for any_gpu in (False, True):
+        files = [package.folder / name for name in ("answer.cpp", "binding.cpp", "level.cpp", "fill.cu")]
+        files += [package.folder / "value.h", *sorted(toolchain.SHARED_INCLUDE.rglob("*.h"))]
+        more = ["13.0", () if any_gpu else ["8.0", "9.0a"], ()]
+        digest = hashlib.sha256(repr(facts + more).encode())
         for path in files:
             content = path.read_bytes()
             digest.update(f"\0{path.name}\0{len(content)}\0".encode() + content)
-        return digest.hexdigest()[:16]
-
-    assert module._library(module.cache_folder, "native").name == f"answer-{digest_of(facts)}.so"
-    shipped = f"answer-portable-{digest_of(['answer', 1, ('-fx', '-fy')])}.so"
-    assert module._library(module.prebuilt_folder, "portable").name == shipped
+        assert module.key("native", any_gpu=any_gpu) == digest.hexdigest()[:16]
+    for folder, any_gpu in ((module.prebuilt_folder, True), (module.cache_folder, False)):
+        key = module.key("native", any_gpu=any_gpu)
+        assert module._library(folder, "native") == folder / f"answer-{key}.so"

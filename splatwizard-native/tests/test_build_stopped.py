@@ -40,8 +40,8 @@ def until(condition) -> None:
     raise AssertionError("it never came about")
 
 
-@pytest.mark.parametrize("call", [MODULE, ALL], ids=["module", "build_all"])
-def test_sigterm_ends_compilers_and_their_children(package, tmp_path, call):
+@pytest.mark.parametrize(("call", "jobs"), [(MODULE, 2), (ALL, 1)], ids=["module", "build_all, a file waits"])
+def test_sigterm_ends_compilers_and_their_children(package, tmp_path, call, jobs):
     package.write("second.cpp", "int second() { return 2; }\n")
     package.write(
         "native.py",
@@ -58,10 +58,10 @@ def test_sigterm_ends_compilers_and_their_children(package, tmp_path, call):
     compiler.chmod(0o755)
     code = textwrap.dedent(BUILD).format(call=call.format(package=package.folder.name))
     paths = [str(package.folder.parent), *filter(None, [os.environ.get("PYTHONPATH")])]
-    environment = {**os.environ, "CXX": str(compiler), "MAX_JOBS": "2", "PYTHONPATH": os.pathsep.join(paths)}
+    environment = {**os.environ, "CXX": str(compiler), "MAX_JOBS": str(jobs), "PYTHONPATH": os.pathsep.join(paths)}
     process = subprocess.Popen([sys.executable, "-c", code], env=environment, stderr=subprocess.PIPE, text=True)
     try:
-        until(lambda: len([f for f in notes.iterdir() if f.name.isdigit()]) == 2)
+        until(lambda: len([f for f in notes.iterdir() if f.name.isdigit()]) == jobs)
         numbers = [int(word) for file in notes.iterdir() for word in file.read_text().split()]
         assert all(map(alive, numbers))
         process.send_signal(signal.SIGTERM)

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from native_package import SHOWN, call, needs_compiler
+from native_package import call, needs_compiler
 
 from splatwizard_native import NativeBuildError
 
@@ -52,7 +52,7 @@ def test_a_compile_error_shows_the_compilers_line_the_log_and_how_to_go_on(packa
 
 @needs_compiler
 def test_a_library_that_was_compiled_but_does_not_load_says_why(package):
-    package.write("answer.cpp", f"int missing();\n{SHOWN} int answer() {{ return missing(); }}\n")
+    package.write("answer.cpp", 'int missing();\nextern "C" int answer() { return missing(); }\n')
     with pytest.raises(NativeBuildError, match=r"does not load: .*undefined symbol.*missing"):
         package.module(headers=()).load()
 

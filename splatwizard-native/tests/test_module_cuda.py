@@ -12,6 +12,9 @@ from splatwizard_native import NativeBuildError, cuda_toolkit, toolchain
 
 CUDA_KERNEL = """
 #include "value.h"
+#ifndef SW_WITH_CUDA
+#error "not told about CUDA"
+#endif
 __global__ void fill(int* out) { out[threadIdx.x] = VALUE; }
 """
 
@@ -39,13 +42,13 @@ def test_cuda_sources_are_compiled_for_each_architecture(package, monkeypatch, t
     package.write("fill.cu", CUDA_KERNEL)
     module = package.module(cuda_sources=("fill.cu",))
     monkeypatch.setattr(torch.version, "cuda", torch.version.cuda or "13.0")
-    monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "8.0 9.0")
+    monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "9.0")
     before = module.key("native")
-    monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "8.0 9.0+PTX")
-    assert module.key("native") != before
+    monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "8.0 9.0")
     assert module.state()["target"] == "cuda"
+    assert module.key("native") != before
     (job,) = [job for job in module._jobs("native", tmp_path) if job.cuda]
-    assert {"-gencode=arch=compute_80,code=sm_80", "-gencode=arch=compute_90,code=compute_90"} <= set(job.flags)
+    assert {"-gencode=arch=compute_80,code=sm_80", "-gencode=arch=compute_90,code=sm_90"} <= set(job.flags)
     toolchain.Toolchain().compile([job], tmp_path / "log")
     assert job.output.stat().st_size > 0
     assert (package.folder / "value.h") in toolchain.read_dependencies(Path(f"{job.output}.d"))
@@ -109,7 +112,6 @@ void look(const float* x, int count, cudaStream_t stream) { kernel<<<count, 1, 0
 def test_a_face_for_gpus_is_built_without_torch_and_tells_cudas_errors(package, monkeypatch):
     import torch
 
-    from splatwizard_native import face
     from splatwizard_native.face_operations import operations
 
     package.write("face.h", GPU_FACE)
@@ -118,7 +120,7 @@ def test_a_face_for_gpus_is_built_without_torch_and_tells_cudas_errors(package, 
     package.write("offered.py", "")
     monkeypatch.setattr(torch.version, "cuda", torch.version.cuda or "13.0")
     monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "9.0")
-    monkeypatch.setattr(face, "current_stream", lambda device: 0)
+    monkeypatch.setattr(torch._C, "_cuda_getCurrentRawStream", lambda device: 0, raising=False)
     module = package.module(cuda_sources=("kernel.cu",), face="face.h")
     module.load()
     assert module.state()["state"] == "built"
@@ -136,22 +138,17 @@ def test_a_face_for_gpus_is_built_without_torch_and_tells_cudas_errors(package, 
 
 
 @needs_compiler
-def test_a_packaged_cuda_library_is_used_without_a_cuda_compiler_if_it_fits_the_gpu(package, monkeypatch, tmp_path):
-    """It lies in the distribution for the CUDA of torch; one of another version of the sources has another name."""
+def test_a_packaged_cuda_library_is_used_without_a_cuda_compiler_if_it_fits_the_gpu(package, monkeypatch):
     import torch
 
     package.write("fill.cu", CUDA_KERNEL)
     module = package.module(cuda_sources=("fill.cu",))
     monkeypatch.setattr(torch.version, "cuda", "13.0")
     monkeypatch.setattr(cuda_toolkit, "find_nvcc", lambda: None)
-    assert module.prebuilt_folder == package.folder / "prebuilt"
-    shipped = tmp_path / "shipped" / "splatwizard_cuda13" / "prebuilt"
-    shipped.mkdir(parents=True)
-    (shipped.parent / "__init__.py").write_text("")
-    monkeypatch.syspath_prepend(str(tmp_path / "shipped"))
-    library = shipped / module.prebuilt_name("portable")
+    library = module._library(module.prebuilt_folder, "portable")
+    library.parent.mkdir()
     library.write_bytes(b"not looked into")
-    facts = {"sha256": digest_of(library), "architectures": ["8.0", "9.0", "12.0a", "12.5+PTX"]}
+    facts = {"sha256": digest_of(library), "architectures": ["8.0", "9.0", "12.0a"]}
     library.with_suffix(".json").write_text(json.dumps(facts))
     for gpu, suits in (
         ((9, 0), True),
@@ -160,12 +157,7 @@ def test_a_packaged_cuda_library_is_used_without_a_cuda_compiler_if_it_fits_the_
         ((10, 0), False),
         ((12, 0), True),
         ((12, 1), False),
-        ((12, 8), True),
-        ((13, 0), True),
     ):
         monkeypatch.setattr(cuda_toolkit, "gpus", lambda gpu=gpu: [gpu])
         assert (library in module._existing()) == suits
         assert (module.available() is None) == suits
-    assert module.state()["state"] == "prebuilt"
-    package.write("fill.cu", CUDA_KERNEL + "// changed\n")
-    assert not list(module._existing())

@@ -1,4 +1,4 @@
-"""One C++ runtime in the process, whatever the compiler brings: modules format numbers and catch errors."""
+"""One C++ runtime in the process, whatever the compiler brings: modules format numbers and let errors pass."""
 
 from __future__ import annotations
 
@@ -15,18 +15,16 @@ pytestmark = [
     pytest.mark.skipif(shutil.which("g++") is None, reason="no g++ on this machine"),
 ]
 
-# A number in a text, and an error that passes through a frame with something to clean up.
+# The message of a failed check, and a throw from torch's runtime through a frame with something to clean up.
 SOURCE = """
 #include <sstream>
-#include <stdexcept>
 #include <string>
-#define SHOWN extern "C" __attribute__((visibility("default")))
-SHOWN int digits() { std::ostringstream text; text << 1234; return int(text.str().size()); }
-void refuse(const std::string& text) { throw std::invalid_argument(text); }
-SHOWN int refused(int n) {
+#include <c10/util/Exception.h>
+extern "C" int digits() { std::ostringstream text; text << 1234; return int(text.str().size()); }
+extern "C" int refused(int n) {
   try {
     std::string kept = "a text that is too long to lie in the string itself: " + std::to_string(n);
-    refuse(kept);
+    TORCH_CHECK(n < 0, kept);
   } catch (const std::exception&) {
     return 1;
   }
@@ -47,8 +45,9 @@ def test_a_module_runs_on_the_runtime_of_torch(flags, tmp_path, monkeypatch):
     tools = toolchain.Toolchain(1)
     source, made, log = tmp_path / "digits.cpp", tmp_path / "digits.so", tmp_path / "log"
     source.write_text(SOURCE, encoding="utf-8")
-    tools.compile([toolchain.Job(source, tmp_path / "digits.o", toolchain.plain_flags())], log)
-    tools.link([tmp_path / "digits.o"], made, log, toolchain.plain_libraries("native", tmp_path / "none"))
+    include = toolchain.torch_include_flags()
+    tools.compile([toolchain.Job(source, tmp_path / "digits.o", (*toolchain.common_flags(), *include))], log)
+    tools.link([tmp_path / "digits.o"], made, log, toolchain.torch_libraries(cuda=False))
     done = subprocess.run([sys.executable, "-c", CALL, str(made)], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.split()) == (0, ["4", "1"]), done.stderr
 

@@ -67,7 +67,8 @@ def test_forecasts_and_drawn_values(device, of, phase, rounds, moves_steps, adap
         results = list(zip((drawn, *forecast), weights, strict=True))[: 1 if of == "drawn values" else 4]
         loss = sum((each * weight).sum() for each, weight in results if each.requires_grad)
         found.append([*forecast, drawn, *slopes(loss, values, *net.parameters())])
-    agree(*found)
+    # The slope of soft rounding makes more of how float sums differ: up to 1.5e-4 was measured on a GPU.
+    agree(*found, tolerance=3e-4 if phase is SOFT and device == "cuda" else 1e-4)
 
 
 @pytest.mark.parametrize("device", DEVICES)

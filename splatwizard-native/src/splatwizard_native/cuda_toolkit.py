@@ -11,7 +11,7 @@ from pathlib import Path
 
 from splatwizard_native.errors import NativeBuildError
 
-ARCHITECTURE = re.compile(r"(\d+)\.(\d)([af]?)(\+PTX)?")
+ARCHITECTURE = re.compile(r"(\d+)\.(\d)([af]?)")
 
 
 def find_nvcc() -> str | None:
@@ -41,13 +41,6 @@ def root_of(nvcc: str) -> Path:
     return next((home for home in homes if (home / "include" / "cuda_runtime.h").is_file()), beside)
 
 
-def major_of_torch() -> str:
-    """Return the major version of CUDA that torch is built for; empty without."""
-    import torch
-
-    return (torch.version.cuda or "").partition(".")[0]
-
-
 def toolkit_mismatch() -> str | None:
     """The reason why CUDA kernels for this torch cannot be compiled here, or None."""
     import torch
@@ -55,7 +48,7 @@ def toolkit_mismatch() -> str | None:
     wanted = torch.version.cuda
     if wanted is None:
         return "this torch is built without CUDA: install a CUDA build of torch"
-    major = major_of_torch()
+    major = wanted.partition(".")[0]
     nvcc = find_nvcc()
     if nvcc is None:
         return (
@@ -77,7 +70,7 @@ def architectures() -> list[str]:
     """Compute capabilities to compile for: $TORCH_CUDA_ARCH_LIST, else those of the GPUs here, else 8.0 and 9.0."""
     listed = os.environ.get("TORCH_CUDA_ARCH_LIST", "")
     if listed:
-        asked = sorted(a for a in re.split(r"[ ;,]+", listed) if a)
+        asked = sorted(a.removesuffix("+PTX") for a in re.split(r"[ ;,]+", listed) if a)
         for a in asked:
             if not ARCHITECTURE.fullmatch(a):
                 raise NativeBuildError(f"$TORCH_CUDA_ARCH_LIST names '{a}': give compute capabilities, as 8.0;9.0")
@@ -85,24 +78,12 @@ def architectures() -> list[str]:
     return [f"{major}.{minor}" for major, minor in gpus()] or ["8.0", "9.0"]
 
 
-def code_flags() -> list[str]:
-    """Flags of nvcc: machine code of each architecture, and of "12.0+PTX" also what later GPUs are compiled from."""
-    flags = []
-    for architecture in architectures():
-        plain = architecture.removesuffix("+PTX").replace(".", "")
-        kinds = [f"sm_{plain}", *([f"compute_{plain}"] if architecture.endswith("+PTX") else [])]
-        flags += [f"-gencode=arch=compute_{plain},code={kind}" for kind in kinds]
-    return flags
-
-
 def runs_on(architecture: str, gpu: tuple[int, int]) -> bool:
-    """Whether code runs there: of "8.0" on 8.0 and any later 8.x, of "9.0a" on 9.0 alone, of "8.0+PTX" on all later."""
+    """Whether machine code runs there: of "8.0" on 8.0 and any later 8.x, of "9.0a" on 9.0 alone."""
     found = ARCHITECTURE.fullmatch(architecture)
     if found is None:
         return False
     major, minor = int(found[1]), int(found[2])
-    if found[4] and gpu >= (major, minor):
-        return True
     return gpu == (major, minor) if found[3] else gpu[0] == major and gpu[1] >= minor
 
 

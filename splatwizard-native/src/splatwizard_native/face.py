@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple, NoReturn
 
 ABI = 1
@@ -85,15 +85,12 @@ def structure(name: str, fields: list[Field], *, call: bool = False) -> Any:
     return type(name, (ctypes.Structure,), {"_fields_": [*(HEAD if call else ()), *listed]})
 
 
-def operation(
-    name: str, fields: list[Field], function: Any, told: Callable[[], bytes], run: int | None, *, on_gpu: bool = False
-) -> Any:
+def operation(name: str, fields: list[Field], function: Any, told: Any, run: int | None, *, on_gpu: bool) -> Any:
     """Return a Python function of the fields by name, which calls `function` and returns the struct with its results.
 
-    told    gives the text of the library's last error
+    told    function that gives the text of the library's last error
     run     address of what runs loops on threads
-    on_gpu  tensors are on one GPU, and the work goes to its current stream: that of the first tensor, which the
-            keyword `device` tells where none is handed over
+    on_gpu  tensors are on one GPU, of which the keyword `device` tells where there is none; its current stream works
 
     A pointer takes a tensor, a ctypes array, an address, or None where the header says so. RuntimeError for what does
     not fit the header, and with the library's text if it refuses.
@@ -112,8 +109,7 @@ def operation(
     # With an underscore, as no field begins: fields are the arguments.
     known = {
         "_torch": torch, "_Tensor": torch.Tensor, "_threads": torch.get_num_threads, "_addressof": ctypes.addressof,
-        "_byref": ctypes.byref, "_stream": current_stream, "_fields": fields, "_refuse": refuse,
-        "_function": function, "_told": told,
+        "_byref": ctypes.byref, "_fields": fields, "_refuse": refuse, "_function": function, "_told": told,
         "_struct": structure(f"{name}_call", fields, call=True),
         "_pointers": lambda field: ctypes.c_void_p * field.length,
         "_numbers": lambda field: NUMBERS[field.kind][1] * field.length,
@@ -121,15 +117,6 @@ def operation(
     # As dataclasses are made: a loop over the fields took three times as long.
     exec(compile(_source(name, fields, run, on_gpu), f"<{name}>", "exec"), known)
     return known[name]
-
-
-def current_stream(device: int) -> int:
-    """Return the handle of the stream on which torch works on a GPU."""
-    import torch
-
-    # The public way makes an object of it, and takes ten times as long.
-    stream: int = torch._C._cuda_getCurrentRawStream(device)
-    return stream
 
 
 def _source(name: str, fields: list[Field], run: int | None, on_gpu: bool) -> str:
@@ -173,7 +160,8 @@ def _source(name: str, fields: list[Field], run: int | None, on_gpu: bool) -> st
             check.append(f"else: {at} = {x} if {passed} else _addressof({x})")
         values.append(f"_at_{x}")
     arguments = [f"{f.name}=None" if f.optional or f.out or f.name in counts else f.name for f in fields]
-    where = "1, device, _stream(device)" if on_gpu else "_threads(), -1, None"
+    # The public way to a stream makes an object of it, and takes ten times as long.
+    where = "1, device, _torch._C._cuda_getCurrentRawStream(device)" if on_gpu else "_threads(), -1, None"
     size = ctypes.sizeof(structure(name, fields, call=True))
     code = [
         *bind, *check, f"_call = _struct({size}, {ABI}, {where}, {run}, {', '.join(values)})",

@@ -34,9 +34,8 @@ def operations(module: NativeModule, face: str) -> Callable[[str], Any]:
         elif (module.name, name) in OPERATION.findall(header):
             function = getattr(module.library, f"{module.name}_{name}")
             told = getattr(module.library, f"{module.name}_last_error")
-            on_gpu = bool(module.cuda_sources)
-            run = None if on_gpu else pool_runner()
-            found = operation(name, structs[f"{name}_call"], function, told, run, on_gpu=on_gpu)
+            run = None if module.cuda_sources else pool_runner()
+            found = operation(name, structs[f"{name}_call"], function, told, run, on_gpu=bool(module.cuda_sources))
         else:
             raise AttributeError(f"'{module.name}' has no operation '{name}'")
         setattr(sys.modules[face], name, found)

@@ -1,6 +1,6 @@
 """Native modules: C++ and CUDA sources that ship with a package, found prebuilt, cached, or compiled on first use.
 
-A module has a plain C face (docs/native.md): no torch is in it, so that one binary serves every version.
+A module has a plain C face (docs/native.md), or registers ops with TORCH_LIBRARY.
 Environment: SPLATWIZARD_CACHE (where builds go), SPLATWIZARD_NATIVE=0 (do without native code),
 SPLATWIZARD_BUILD_TIMEOUT (seconds to wait for another process's build), CXX, CUDA_HOME, TORCH_CUDA_ARCH_LIST (compute
 capabilities to build for, as "8.0;9.0"; without it those of the GPUs here), MAX_JOBS.
@@ -8,10 +8,10 @@ capabilities to build for, as "8.0;9.0"; without it those of the GPUs here), MAX
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import functools
 import hashlib
+import importlib.metadata
 import importlib.util
 import itertools
 import logging
@@ -29,10 +29,10 @@ from typing import Any
 from splatwizard_native import cuda_toolkit, toolchain
 from splatwizard_native.errors import NativeBuildError
 from splatwizard_native.face import ABI, OPERATION
-from splatwizard_native.library import architectures_of, fetch, install, is_intact, keep, open_face
+from splatwizard_native.library import architectures_of, fetch, install, is_intact, keep, load_ops, open_face
 from splatwizard_native.lock import build_lock
 from splatwizard_native.settings import SWITCHED_OFF, build_timeout, cache_root, switched_off
-from splatwizard_native.toolchain import Job, Toolchain
+from splatwizard_native.toolchain import Job, Toolchain, plain_libraries, torch_libraries
 from splatwizard_native.work_clock import loading
 
 log = logging.getLogger(__name__)
@@ -46,6 +46,7 @@ Say = Callable[[str], None]
 class _Session:
     """State of a module in this process, shared by all: a loaded library cannot be unloaded.
 
+    library what was loaded, if it has a plain C face
     cuda    whether its module for GPUs is loaded; None: nobody has asked yet
     """
 
@@ -62,12 +63,13 @@ class NativeModule:
 
     name            of the library's file; what C functions of a face begin with
     package         import package whose folder the paths below are relative to
-    sources         C++ files compiled once: what stands behind the face
-    kernels         C++ files compiled once per instruction set, in `namespace SW_ARCH` (<splatwizard/dispatch.h>)
+    sources         C++ files compiled once: the binding file, or what stands behind the face
+    kernels         C++ files compiled once per instruction set, in `namespace SW_ARCH` (<splatwizard/dispatch.h>);
+                    they see no torch header
     headers         every header that the files above include from the package; globs are allowed
-    face            header of the operations (<splatwizard/c_face.h>)
-    cuda            the module of the same operations on a GPU
-    cuda_sources    .cu files: this is a module for GPUs, compiled by nvcc, and only where torch has CUDA
+    face            header of a plain C face (<splatwizard/c_face.h>): one binary for any torch; none: torch ops
+    cuda            the same for tensors on a GPU, as a library of its own: torch ops, or a face too
+    cuda_sources    .cu files: this is a module for GPUs, compiled (with SW_WITH_CUDA defined) only where torch has CUDA
     cflags          more flags for sources and kernels
     without         what happens without this module, told to the user when it cannot be built
     """
@@ -148,17 +150,15 @@ class NativeModule:
 
     @property
     def library(self) -> ctypes.CDLL:
-        """Return the library, loaded now if it is not yet. Raises NativeBuildError."""
+        """Return the library of a module with a face, loaded now if it is not yet. Raises NativeBuildError."""
         self.load()
-        assert self._session.library is not None
+        assert self._session.library is not None, f"'{self.name}' has no plain C face"
         return self._session.library
 
     @property
     def face_header(self) -> str:
         """Return the text of the header that C and Python read, with that of the package's own that it includes."""
         path = self._root() / self.face
-        if not self.face:
-            return ""
         included = lambda found: (path.parent / found[1]).read_text("utf-8")  # noqa: E731
         return re.sub(r'^#include "(.+)"$', included, path.read_text("utf-8"), flags=re.MULTILINE)
 
@@ -176,10 +176,7 @@ class NativeModule:
             if session.loaded is None and switched_off():
                 return SWITCHED_OFF
             if session.loaded is None and next(self._existing(), None) is None:
-                missing = cuda_toolkit.toolkit_mismatch() if self.cuda_sources else None
-                if missing is not None:
-                    return missing
-                toolchain.find_compiler()
+                self._find_compilers()
         except NativeBuildError as error:
             return str(error)
         return None
@@ -233,13 +230,7 @@ class NativeModule:
 
     @property
     def prebuilt_folder(self) -> Path:
-        """Folder where a wheel, or `sw build-kernels --portable`, puts the library.
-
-        Those for GPUs are all in the distribution of the major version of CUDA that torch has, if it is installed.
-        """
-        if self.cuda_sources:
-            with contextlib.suppress(NativeBuildError):
-                return _folder_of(f"splatwizard_cuda{cuda_toolkit.major_of_torch()}") / "prebuilt"
+        """Folder where a wheel, or `sw build-kernels --portable`, puts the library."""
         return self._root() / "prebuilt"
 
     @property
@@ -247,17 +238,24 @@ class NativeModule:
         """Folder of builds for this user."""
         return cache_root() / "native"
 
-    def key(self, march: str) -> str:
-        """Digest of all that the binary in the cache depends on: the CPU or the GPUs here, flags, sources."""
-        # The empty flags at the end are those of the linker: modules had some, and older builds stay valid.
+    def key(self, march: str, *, any_gpu: bool = False) -> str:
+        """Digest of all that the binary depends on: torch and CUDA if it uses them, the CPU if native, flags, sources.
+
+        any_gpu     leave the GPUs' architectures out: a binary in a package says itself which ones it holds
+        """
+        torch = None if self.face else importlib.import_module("torch")  # a library with a face is built without it
+        # The empty flags at the two ends are those of linker and nvcc: modules had some, and older builds stay valid.
         facts: list[object] = [
-            self.name, f"ABI {ABI}", toolchain.plain_flags(), platform.system(), platform.machine(), march,
+            self.name, f"ABI {ABI}" if torch is None else str(torch.__version__), self._common_flags(),
+            platform.system(), platform.machine(), march,
             toolchain.arch_variants(march), toolchain.cpu_identity() if march == "native" else "", self.cflags, (),
         ]  # fmt: skip
-        return self._digest(facts + (cuda_toolkit.architectures() if self.cuda_sources else []), self._files())
+        if self.cuda_sources:
+            facts += [torch and torch.version.cuda, () if any_gpu else cuda_toolkit.architectures(), ()]
+        return self._digest(facts, self._files())
 
     def source_hash(self) -> str:
-        """Digest of sources and flags, whatever compiles them: the library tells it."""
+        """Digest of sources and flags, whatever compiles them: a library with a face tells it."""
         return self._digest([self.name, ABI, self.cflags], self._files())
 
     def _digest(self, facts: list[object], files: Sequence[Path]) -> str:
@@ -278,9 +276,6 @@ class NativeModule:
                 return
         except NativeBuildError as error:
             log.warning("%s; it is compiled anew", error)
-        missing = cuda_toolkit.toolkit_mismatch() if self.cuda_sources else None
-        if missing is not None:
-            raise self._failure(missing)
         library = self.build(force=self.is_built("native"), say=say)
         problem = self._open(library)
         if problem is not None:
@@ -288,11 +283,14 @@ class NativeModule:
 
     def _open(self, library: Path) -> str | None:
         """Load a library; the reason if that fails."""
-        symbols = [f"{module}_{op}" for module, op in OPERATION.findall(self.face_header) if module == self.name]
-        try:
-            self._session.library = open_face(library, self.name, self.source_hash(), symbols)
-        except OSError as error:
-            return str(error)
+        if self.face:
+            symbols = [f"{module}_{op}" for module, op in OPERATION.findall(self.face_header) if module == self.name]
+            try:
+                self._session.library = open_face(library, self.name, self.source_hash(), symbols)
+            except OSError as error:
+                return str(error)
+        elif (problem := load_ops(library)) is not None:
+            return problem
         self._session.loaded = library
         return None
 
@@ -310,15 +308,19 @@ class NativeModule:
             yield self._library(folder, march)
 
     def prebuilt_name(self, march: str) -> str:
-        """File name in a package: the wheel around it tells for which machine."""
+        """File name in a package of a library with a face: the wheel around it tells for which machine."""
         return f"{self.name}-{march}-{self.source_hash()}.so"
 
     def _library(self, folder: Path, march: str) -> Path:
-        name = self.prebuilt_name(march) if folder == self.prebuilt_folder else f"{self.name}-{self.key(march)}.so"
-        return folder / name
+        if self.face and folder == self.prebuilt_folder:
+            return folder / self.prebuilt_name(march)
+        return folder / f"{self.name}-{self.key(march, any_gpu=folder == self.prebuilt_folder)}.so"
 
     def _root(self) -> Path:
-        return _folder_of(self.package)
+        spec = importlib.util.find_spec(self.package)
+        if spec is None or not spec.submodule_search_locations:
+            raise NativeBuildError(f"native module '{self.name}': package '{self.package}' is not a folder on disk")
+        return Path(next(iter(spec.submodule_search_locations)))
 
     def _files(self) -> list[Path]:
         """All files that the binary is made from, in a fixed order."""
@@ -327,42 +329,60 @@ class NativeModule:
         shared = sorted(toolchain.SHARED_INCLUDE.rglob("*.h"))
         return [*(root / s for s in (*self.sources, *self.kernels, *self.cuda_sources)), *headers, *shared]
 
+    def _find_compilers(self) -> None:
+        """Raise NativeBuildError where a compiler that this module needs is not there."""
+        if self.cuda_sources and (missing := cuda_toolkit.toolkit_mismatch()) is not None:
+            raise NativeBuildError(missing)
+        toolchain.find_compiler()
+
+    def _common_flags(self) -> tuple[str, ...]:
+        return toolchain.plain_flags() if self.face else toolchain.common_flags()
+
     def _jobs(self, march: str, objects: Path) -> list[Job]:
         root, cuda = self._root(), bool(self.cuda_sources)
         variants = toolchain.arch_variants(march)
-        shared = [*toolchain.plain_flags()]
+        shared = [*self._common_flags(), *(["-DSW_WITH_CUDA"] if cuda else [])]
         if "arch_v2" in variants:
             shared.append("-DSW_PORTABLE_X86")
-        # What stands behind the face runs on every machine that the binary is for: it gets the lowest of the variants.
+        # The binding runs on every machine that the binary is for, so it gets the lowest of the variants.
         lowest = next(iter(variants.values()))
-        include = (*toolchain.SHARED_INCLUDE_FLAGS, *(toolchain.cuda_include_flags() if cuda else ()))
-        told = objects / f"{self.name}.cpp"
-        told.write_text(f'#include <splatwizard/c_face.h>\nSW_FACE({self.name}, "{self.source_hash()}")\n', "utf-8")
-        sources = [*(root / s for s in self.sources), told]
-        flags = (*shared, *lowest, *include, *self.cflags)
-        jobs = [Job(source, objects / f"{i}.o", flags) for i, source in enumerate(sources)]
+        include = toolchain.SHARED_INCLUDE_FLAGS
+        theirs = () if self.face else toolchain.torch_include_flags()
+        theirs += toolchain.cuda_flags("-isystem", "include") if cuda else ()
+        binding = (*shared, *lowest, *include, *theirs, *self.cflags)
+        sources = [root / s for s in self.sources]
+        if self.face:
+            sources.append(objects / f"{self.name}.cpp")
+            sources[-1].write_text(
+                f'#include <splatwizard/c_face.h>\nSW_FACE({self.name}, "{self.source_hash()}")\n', "utf-8"
+            )
+        jobs = [Job(source, objects / f"{i}.o", binding) for i, source in enumerate(sources)]
         # Lowest level first: of inline functions that several objects emit the linker keeps the first, and that
         # one must run on every machine.
-        for arch, own in variants.items():
-            kernel = (*shared, *include, *self.cflags, *own, f"-DSW_ARCH={arch}")
+        for arch, flags in variants.items():
+            kernel = (*shared, *include, *self.cflags, *flags, f"-DSW_ARCH={arch}")
             jobs += [Job(root / s, objects / f"{arch}-{i}.o", kernel) for i, s in enumerate(self.kernels)]
-        nvcc = (*toolchain.nvcc_flags(), *toolchain.SHARED_INCLUDE_FLAGS) if cuda else ()
-        jobs += [Job(root / s, objects / f"cuda-{i}.o", nvcc, cuda=True) for i, s in enumerate(self.cuda_sources)]
+        if cuda:
+            plain = [a.replace(".", "") for a in cuda_toolkit.architectures()]
+            gencode = [f"-gencode=arch=compute_{a},code=sm_{a}" for a in plain]
+            flags = ("-std=c++20", "-O3", "-Xcompiler", "-fPIC", "-DSW_WITH_CUDA", *gencode, *include)
+            jobs += [Job(root / s, objects / f"cuda-{i}.o", flags, cuda=True) for i, s in enumerate(self.cuda_sources)]
         return jobs
 
     def _kept(self, jobs: Sequence[Job], compiler: str) -> list[Path]:
         """Places of objects, by all that they depend on, so that one changed file is compiled alone."""
         headers = [path for path in self._files() if path.suffix == ".h"]
-        folder = self.cache_folder / "objects"
+        folder, torchs = self.cache_folder / "objects", "" if self.face else importlib.metadata.version("torch")
         places = []
         for job in jobs:
-            facts: list[object] = [compiler, [f for f in job.flags if f != str(toolchain.SHARED_INCLUDE)]]
+            facts: list[object] = [compiler, torchs, [f for f in job.flags if f != str(toolchain.SHARED_INCLUDE)]]
             places.append(folder / f"{job.source.stem}-{self._digest(facts, [job.source, *headers])}.o")
         return places
 
     def _compile(self, library: Path, march: str, tools: Toolchain, say: Say, force: bool) -> None:
+        self._find_compilers()
         say(f"compiling kernels '{self.name}' (once) ...")
-        started = time.monotonic()
+        started, cuda = time.monotonic(), bool(self.cuda_sources)
         build_log = library.with_suffix(".log")
         build_log.unlink(missing_ok=True)
         prefix = f".{library.stem}-"
@@ -373,12 +393,12 @@ class NativeModule:
             kept = dict(zip(jobs, self._kept(jobs, tools.version()), strict=True))
             missing = [job for job, place in kept.items() if force or not fetch(place, job.output)]
             built, shown = Path(scratch) / library.name, Path(scratch) / "shown"
-            shown.write_text(f"{{ global: {self.name}*; local: *; }};\n", "utf-8")
+            shown.write_text(f"{{ global: {self.name}_*; local: *; }};\n", "utf-8")
             try:
                 tools.compile(missing, build_log)
                 self._check_headers(missing)
-                libraries = toolchain.plain_libraries(march, shown, cuda=bool(self.cuda_sources))
-                tools.link([j.output for j in jobs], built, build_log, libraries)
+                linked = plain_libraries(march, shown, cuda=cuda) if self.face else torch_libraries(cuda=cuda)
+                tools.link([j.output for j in jobs], built, build_log, linked)
             except NativeBuildError as error:
                 raise NativeBuildError(f"\n{error}\nfull log: {build_log}") from error
             for job in missing:
@@ -388,7 +408,7 @@ class NativeModule:
                 "seconds": seconds,
                 "compiler": tools.version(),
                 "march": march,
-                "architectures": cuda_toolkit.architectures() if self.cuda_sources else [],
+                "architectures": cuda_toolkit.architectures() if cuda else [],
             }
             install(built, library, facts)
         say(f"compiled kernels '{self.name}' in {seconds:.0f} s")
@@ -409,13 +429,6 @@ class NativeModule:
     def _failure(self, reason: object) -> NativeBuildError:
         without = f"\nwithout them: {self.without}" if self.without else ""
         return NativeBuildError(f"kernels '{self.name}' are not available: {reason}{without}")
-
-
-def _folder_of(package: str) -> Path:
-    spec = importlib.util.find_spec(package)
-    if spec is None or not spec.submodule_search_locations:
-        raise NativeBuildError(f"package '{package}' is not a folder on disk")
-    return Path(next(iter(spec.submodule_search_locations)))
 
 
 @functools.cache

@@ -1,7 +1,7 @@
 """Drives the compilers: finds them, knows the flags, compiles in parallel, and makes their errors readable.
 
 Not torch.utils.cpp_extension: that gives one set of flags to all files of a module, needs ninja and setuptools,
-and waits for ever on the lock of a dead process.
+and waits for ever on the lock of a dead process. What is left to know is the two lists of paths below.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterable, Sequence
-from concurrent.futures import CancelledError, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -82,19 +82,31 @@ def cpu_identity() -> str:
 
 
 def plain_flags() -> tuple[str, ...]:
-    """C++ flags of all modules."""
+    """C++ flags of a module with a plain C face."""
     return ("-std=c++20", "-O3", "-fPIC", "-fvisibility=hidden", "-fopenmp-simd", "-pthread")
 
 
-def cuda_include_flags() -> tuple[str, ...]:
-    """-isystem flags for CUDA's headers."""
-    nvcc = cuda_toolkit.find_nvcc()
-    return () if nvcc is None else ("-isystem", str(cuda_toolkit.root_of(nvcc) / "include"))
+def common_flags() -> tuple[str, ...]:
+    """C++ flags of a module of torch ops."""
+    import torch
+
+    flags = ["-std=c++20", "-O3", "-fPIC", f"-D_GLIBCXX_USE_CXX11_ABI={int(torch._C._GLIBCXX_USE_CXX11_ABI)}"]
+    if sys.platform != "darwin":  # Apple's compiler has no OpenMP; at::parallel_for then runs on one thread.
+        flags.append("-fopenmp")
+    return tuple(flags)
 
 
-def nvcc_flags() -> tuple[str, ...]:
-    """Flags of CUDA sources, for all GPUs that are asked for."""
-    return ("-std=c++20", "-O3", "-Xcompiler", "-fPIC", *cuda_toolkit.code_flags())
+def torch_include_flags() -> tuple[str, ...]:
+    """-isystem flags for torch's headers."""
+    import torch
+
+    base = Path(torch.__file__).parent / "include"
+    return "-isystem", str(base), "-isystem", str(base / "torch" / "csrc" / "api" / "include")
+
+
+def cuda_flags(flag: str, folder: str) -> tuple[str, ...]:
+    """Return a flag and the folder of the CUDA toolkit that it is for."""
+    return flag, str(cuda_toolkit.root_of(cuda_toolkit.find_nvcc() or "nvcc") / folder)
 
 
 def arch_variants(march: str) -> dict[str, tuple[str, ...]]:
@@ -131,18 +143,14 @@ class Toolchain:
             compiler = [str(cuda_toolkit.find_nvcc())] if job.cuda else self.compiler
             written = ["-MD", "-MF", f"{job.output}.d", "-c", str(job.source), "-o", str(job.output)]
             runs.append(self._pool.submit(self._compilers.run, [*compiler, *job.flags, *written], log))
-        failed = None
         try:
-            for run in runs:  # to the end of all, whatever becomes of the first
-                try:
-                    run.result()
-                except (NativeBuildError, CancelledError) as error:
-                    failed = failed or error
+            for run in runs:  # to the end of all; `wait` is told of none that was called off before it began
+                run.exception()
         except BaseException:  # asked to end: nobody waits for what compilers do meanwhile
             self.stop()
             raise
-        if failed is not None:
-            raise failed if isinstance(failed, NativeBuildError) else NativeBuildError("the build was stopped")
+        for run in runs:
+            run.result()
 
     def link(self, objects: Iterable[Path], output: Path, log: Path, libraries: Sequence[str]) -> None:
         """Link a shared library."""
@@ -161,21 +169,26 @@ class Toolchain:
         self._compilers.stop()
 
 
+def torch_libraries(*, cuda: bool) -> list[str]:
+    """Return what links a library against torch's, after the C++ runtime of this process."""
+    import torch
+
+    libraries = ["-L", str(Path(torch.__file__).parent / "lib"), "-ltorch", "-ltorch_cpu", "-lc10"]
+    libraries += ["-ltorch_cuda", "-lc10_cuda", *cuda_flags("-L", "lib64"), "-lcudart"] if cuda else []
+    extra = ["-fopenmp"] if sys.platform != "darwin" else ["-undefined", "dynamic_lookup"]
+    return [*runtime_libraries(), *extra, *libraries]
+
+
 def plain_libraries(march: str, shown: Path, *, cuda: bool = False) -> list[str]:
-    """Return what links a library: a portable one brings its C++ runtime, and shows a list.
+    """Return what links a library with a plain C face: a portable one brings its C++ runtime, shows a list.
 
     One for GPUs brings CUDA's runtime, and hides it: it must not mix with that of torch, which may be another one.
     """
-    nvcc = cuda_toolkit.find_nvcc() if cuda else None
-    libraries = ["-pthread"]
-    if nvcc is not None:
-        libraries += ["-L", str(cuda_toolkit.root_of(nvcc) / "lib64"), "-lcudart_static", "-ldl", "-lrt"]
-    portable = march != "native" and sys.platform == "linux"
-    if portable or cuda:
-        libraries.append(f"-Wl,--version-script={shown}")
-    if portable:
-        return [*libraries, "-static-libstdc++", "-static-libgcc", "-Wl,-s"]
-    return [*runtime_libraries(), *libraries]
+    runtime = [*cuda_flags("-L", "lib64"), "-lcudart_static", "-ldl", "-lrt"] if cuda else []
+    shows = f"-Wl,--version-script={shown}"
+    if march != "native" and sys.platform == "linux":
+        return ["-pthread", *runtime, "-static-libstdc++", "-static-libgcc", shows, "-Wl,-s"]
+    return [*runtime_libraries(), "-pthread", *runtime, *([shows] if cuda else [])]
 
 
 def runtime_libraries() -> list[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -11,12 +10,11 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
-from splatwizard_native.fused import cuda_face, face
+from splatwizard_native.fused import face
 from splatwizard_native.fused.native import TRAINING
 
 Padding = Literal["same", "valid"]
 
-TILE = 32  # pixels of a block of the CUDA kernel, each way
 RADIUS = 5  # 11 x 11 window
 SIGMA = 1.5
 C1 = 0.01**2
@@ -49,7 +47,7 @@ class _Photometric(torch.autograd.Function):
     def forward(
         ctx: Any, x: Tensor, y: Tensor, valid: bool, l1_weight: float, ssim_weight: float, offset: float
     ) -> tuple[Tensor, Tensor, Tensor]:
-        image, target = _planes(x), _planes(y)
+        image, target = (t.reshape(-1, *t.shape[-2:]).contiguous() for t in (x, y))
         grad = torch.empty_like(image) if ctx.needs_input_grad[0] else None
         found = face.photometric(
             x=image, y=target, valid=valid, l1_weight=l1_weight, ssim_weight=ssim_weight, grad=grad,
@@ -67,41 +65,6 @@ class _Photometric(torch.autograd.Function):
         # Nearly always the loss itself is differentiated: then there is nothing to multiply.
         scaled = grad if grad is None or float(grad_output) == 1.0 else grad * grad_output
         return scaled, None, None, None, None, None
-
-
-class _PhotometricOnCuda(torch.autograd.Function):
-    """As `_Photometric`, without waiting for a number; the gradient is put together when its scale is known."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, learns: bool, x: Tensor, y: Tensor, valid: bool, l1_weight: float, ssim_weight: float, offset: float
-    ) -> tuple[Tensor, ...]:
-        image, target = _planes(x), _planes(y)
-        planes, height, width = image.shape
-        # Each a tensor of its own: views of one could not be changed in place.
-        total, l1, similarity = found = tuple(image.new_empty(()) for _ in range(3))
-        slopes = image.new_empty(3, *image.shape) if learns else None
-        ctx.weights = {"valid": valid, "l1_weight": l1_weight, "ssim_weight": ssim_weight}
-        cuda_face.photometric_loss(
-            x=image, y=target, **ctx.weights, offset=offset, total=total, l1=l1, ssim=similarity, slopes=slopes,
-            sums=image.new_empty(2 + 2 * planes * -(-height // TILE) * -(-width // TILE)),
-        )  # fmt: skip
-        ctx.mark_non_differentiable(l1, similarity)
-        ctx.save_for_backward(image, target, slopes)
-        ctx.shape = x.shape
-        return found
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, scale: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
-        image, target, slopes = ctx.saved_tensors
-        grad = torch.empty_like(image)
-        cuda_face.photometric_loss_backward(x=image, y=target, slopes=slopes, **ctx.weights, scale=scale, grad=grad)
-        return None, grad.view(ctx.shape), *[None] * 5
-
-
-def _planes(x: Tensor) -> Tensor:
-    return x.reshape(-1, *x.shape[-2:]).contiguous()
 
 
 def ssim_map(x: Tensor, y: Tensor, padding: Padding = "same") -> Tensor:
@@ -128,6 +91,6 @@ def _fused(x: Tensor, y: Tensor) -> Callable[..., tuple[Tensor, Tensor, Tensor]]
     if x.dtype != torch.float32 or y.requires_grad:
         return None
     if x.is_cuda:
-        learns = torch.is_grad_enabled() and x.requires_grad
-        return partial(_PhotometricOnCuda.apply, learns) if TRAINING.has_cuda() else None
+        # A node in C++, where no number is waited for: one in Python took the host as long as the kernels the device.
+        return torch.ops.splatwizard_training.photometric_loss if TRAINING.has_cuda() else None
     return _Photometric.apply if x.device.type == "cpu" and TRAINING.try_load() else None

@@ -3,12 +3,12 @@
 // The files that a NativeModule lists as `kernels` are compiled once per instruction set, each time with SW_ARCH
 // defined as another namespace: arch_native for a build on the machine that runs it, arch_v2, arch_v3 and arch_v4
 // (the x86-64 levels) for a binary that travels. A kernel file puts everything into `namespace SW_ARCH`.
-// The header that the file behind the face reads declares it for all of them:
+// The header that the binding file reads declares it for all of them:
 //
 //   #define DECLARE(arch) namespace arch { void scale(float* x, int64_t n); }
 //   SW_FOR_EACH_ARCH(DECLARE)
 //
-// and that file calls SW_SELECT(scale)(x, n): the best one that this CPU can run.
+// and the binding calls SW_SELECT(scale)(x, n): the best one that this CPU can run.
 #pragma once
 
 #ifdef SW_PORTABLE_X86

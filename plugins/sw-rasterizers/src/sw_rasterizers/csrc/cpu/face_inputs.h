@@ -1,14 +1,13 @@
-// What stands behind the faces: their calls as the kernels take them, with their counts checked.
+// What stands behind face.h: its calls as the kernels take them, with their counts checked.
 #pragma once
-
-#include <splatwizard/c_face.h>
 
 #include <chrono>
 #include <limits>
 
-#include "call.h"
-#include "camera.h"
-#include "flags.h"
+#include "../call.h"
+#include "../camera.h"
+#include "face.h"
+#include "../flags.h"
 
 namespace sw {
 
@@ -73,8 +72,7 @@ int64_t tiles_of(const View<S>& view) {
   return int64_t(view.tiles_x()) * view.tiles_y();
 }
 
-// `parallel` null: on a GPU.
-inline Settings settings_of(int64_t flags, const Parallel* parallel) {
+inline Settings settings_of(int64_t flags, const Parallel& parallel) {
   Settings s;
   s.antialias = flags & kAntialias, s.clamp_color = flags & kClampColor, s.tight = flags & kTight;
   s.pass_clamp = flags & kPassClamp, s.original_jacobian = flags & kOriginalJacobian;
@@ -82,20 +80,15 @@ inline Settings settings_of(int64_t flags, const Parallel* parallel) {
   s.accumulated_depth = flags & kAccumulatedDepth, s.median_depth = flags & kMedianDepth;
   s.detach_features = flags & kDetachFeatures, s.absgrad = flags & kAbsgrad;
   s.fragments = flags & kFragments;
-  s.parallel = parallel;
+  s.parallel = &parallel;
   return s;
 }
-inline Settings settings_of(int64_t flags, const Parallel& parallel) { return settings_of(flags, &parallel); }
 
 template <class Call>
-Settings settings_of(const Call& call, const Parallel* parallel) {
+Settings settings_of(const Call& call, const Parallel& parallel) {
   Settings s = settings_of(call.flags, parallel);
   s.scale_modifier = call.scale_modifier, s.eps2d = call.eps2d;
   return s;
-}
-template <class Call>
-Settings settings_of(const Call& call, const Parallel& parallel) {
-  return settings_of(call, &parallel);
 }
 
 // Means and shapes.
@@ -157,25 +150,6 @@ Channels channels_of(const Call& call) {
   if (channels.total() < 1) refuse("there is no channel to draw");
   if ((call.flags & kSurfels) && channels.total() != 3) refuse("surfels have 3 colours, got %d channels", channels.total());
   return channels;
-}
-
-// Where gradients go.
-template <class S, class Call>
-Gradients<S> gradients_of(const Call& call, const Gaussians<S>& g) {
-  Gradients<S> out{};
-  out.means = numbers<S>(call.of_means), out.opacities = numbers<S>(call.of_opacities);
-  out.scales = numbers<S>(call.of_scales), out.quats = numbers<S>(call.of_quats);
-  out.cov3d = numbers<S>(call.of_cov3d), out.colors = numbers<S>(call.of_colors);
-  out.features = numbers<S>(call.of_features), out.scale_factors = numbers<S>(call.of_scale_factors);
-  out.grad2d = numbers<S>(call.of_grad2d), out.absgrad2d = numbers<S>(call.of_absgrad2d);
-  if (call.of_sh != nullptr) {
-    out.sh_dc = numbers<S>(call.of_sh), out.sh_dc_stride = out.sh_rest_stride = g.sh_dc_stride;
-    if (call.sh_rows > 1) out.sh_rest = out.sh_dc + 3;
-  } else {
-    out.sh_dc = numbers<S>(call.of_sh_dc), out.sh_dc_stride = 3;
-    out.sh_rest = numbers<S>(call.of_sh_rest), out.sh_rest_stride = g.sh_rest_stride;
-  }
-  return out;
 }
 
 }  // namespace sw
