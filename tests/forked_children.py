@@ -291,6 +291,8 @@ class Imported:
         for name in names:
             with contextlib.suppress(ImportError):  # whoever needs it is told
                 importlib.import_module(name)
+        if "sw_report.page" in sys.modules:
+            sys.modules["sw_report.page"].page_template()  # compiling it is a quarter of a short run
         found = [name for name in sys.modules if name.startswith("sw_")]
         self._modules = {name: sys.modules.pop(name) for name in found}
 
