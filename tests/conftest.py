@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import importlib.metadata
 import json
+import os
 import textwrap
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -14,19 +17,34 @@ from import_graph import needed
 collect_ignore = ["golden/packages_0_2"]  # its tests run where it is installed (test_package_of_0_2.py)
 
 
+def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
+    """A folder that the first worker of the session fills by `make`, while the others wait for it."""
+    base = factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name
+    with open(f"{folder}.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (made := folder.with_suffix(".made")).exists():
+            folder.mkdir()
+            make(folder)
+            made.touch()
+    return folder
+
+
 @pytest.fixture(scope="session")
 def wheels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """One wheel of each workspace package, by distribution name."""
-    out = tmp_path_factory.mktemp("wheels")
-    return dict(zip((project.name for project in WORKSPACE), build_wheels(WORKSPACE, out), strict=True))
+    folder = made_once(tmp_path_factory, "wheels", lambda folder: build_wheels(WORKSPACE, folder))
+    return {path.name.partition("-")[0].replace("_", "-"): path for path in folder.glob("*.whl")}
 
 
 @pytest.fixture(scope="session")
 def core_environment(tmp_path_factory: pytest.TempPathFactory, wheels: dict[str, Path]) -> FreshEnvironment:
     """An environment with third-party packages, the core and what it requires of ours; to be cloned, not changed."""
-    environment = make_environment(tmp_path_factory.mktemp("core") / "env")
-    environment.install(*(wheels[name] for name in needed("splatwizard-core")))
-    return environment
+
+    def make(folder: Path) -> None:
+        make_environment(folder / "env").pip_install(*(wheels[name] for name in needed("splatwizard-core")))
+
+    return FreshEnvironment(made_once(tmp_path_factory, "core", make) / "env")
 
 
 @pytest.fixture

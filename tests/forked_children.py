@@ -2,10 +2,10 @@
 
 `sw run` decodes and evaluates in processes of their own, and tests start `sw` beside packages that only another process
 has on its path: each does little work after two seconds of imports. A test session starts hundreds. Here a server
-imports torch and the core once and forks for each: the child has an own working directory, environment, path of
-imports, input and output, and nothing of the test's memory, plugins included; what it runs in fresh processes is forked
-from the same server. A child that asks for what only a new interpreter gives (another locale, other threads, hash
-seeds) gets one.
+imports torch, the core and what of the plugins nearly every run needs once and forks for each: the child has an own
+working directory, environment, path of imports, input and output, and nothing of the test's memory; modules of plugins
+are not there until it imports one of them; what it runs in fresh processes is forked from the same server. A child
+that asks for what only a new interpreter gives (another locale, other threads, hash seeds) gets one.
 
 Two failures stay unseen here: an import that only the server's own imports make good, and a crash while an interpreter
 ends. Inside `starting()` tests start what users start.
@@ -14,6 +14,8 @@ ends. Inside `starting()` tests start what users start.
 from __future__ import annotations
 
 import contextlib
+import copy
+import importlib
 import json
 import os
 import select
@@ -23,8 +25,10 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator, Mapping
-from types import SimpleNamespace
+from collections.abc import Iterable, Iterator, Mapping
+from importlib.machinery import ModuleSpec
+from importlib.metadata import entry_points
+from types import ModuleType, SimpleNamespace
 from typing import IO, Any
 
 import splatwizard_core.runs.fresh
@@ -41,6 +45,17 @@ PLAIN = (
 
 The last two are set by a training: without them every run after the first training of a session would get one.
 """
+THEIRS = (
+    "torch", "numpy", "pydantic", "pydantic.dataclasses", "rich.console", "safetensors.torch", "PIL.Image", "jinja2",
+    "scipy.ndimage", "scipy.spatial", "constriction", "plyfile", "zlib_ng.zlib_ng", "tomli_w",
+)  # fmt: skip
+OURS = (
+    *(f"splatwizard_core.{name}" for name in ("cli.run", "cli.codec", "builtin", "tooling", "runs.measure")),
+    "sw_3dgs.method", "sw_codecs.models.codecs", "sw_datasets.demo.dataset", "sw_metrics.perceptual",
+    "sw_rasterizers.standard", "sw_report.after_run", "sw_view.after_run",
+    *(entry.value for entry in entry_points(group="splatwizard") if entry.value.startswith("sw_")),
+)  # fmt: skip
+"""What nearly every run imports: of others, and of ours."""
 START = subprocess.run
 
 
@@ -269,6 +284,35 @@ def starting() -> Iterator[None]:
         fresh.subprocess = before
 
 
+class Imported:
+    """Holds modules of plugins that were imported before the fork, unseen until somebody imports one of them."""
+
+    def __init__(self, names: Iterable[str]) -> None:
+        for name in names:
+            with contextlib.suppress(ImportError):  # whoever needs it is told
+                importlib.import_module(name)
+        if "sw_report.page" in sys.modules:
+            sys.modules["sw_report.page"].page_template()  # compiling it is a quarter of a short run
+        found = [name for name in sys.modules if name.startswith("sw_")]
+        self._modules = {name: sys.modules.pop(name) for name in found}
+
+    def find_spec(self, name: str, path: object = None, target: object = None) -> ModuleSpec | None:
+        if name not in self._modules:
+            return None
+        sys.modules.update(self._modules)
+        sys.meta_path.remove(self)
+        self._own = self._modules[name].__spec__
+        spec = copy.copy(self._own)
+        spec.loader = self  # type: ignore[union-attr]
+        return spec
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        return self._modules[spec.name]
+
+    def exec_module(self, module: ModuleType) -> None:
+        module.__spec__ = self._own
+
+
 def _serve(connection: socket.socket) -> tuple[dict[str, Any], int]:
     """Fork for each request; return in the child its content, which it does, and the descriptor to ask for more.
 
@@ -357,12 +401,10 @@ def _become(content: dict[str, Any], asking: int, ours: list[str]) -> None:
 
 if __name__ == "__main__":
     import gc
-    import importlib
 
-    for name in ("torch", "numpy", "pydantic", "rich.console", "safetensors.torch", "PIL.Image", "scipy.ndimage"):
+    for name in THEIRS:
         importlib.import_module(name)
-    for name in ("cli.main", "runs.decode", "runs.session", "runs.measure", "method", "coding.container"):
-        importlib.import_module(f"splatwizard_core.{name}")
+    sys.meta_path.insert(0, Imported(OURS))
     gc.freeze()  # else the children's first collections copy all its memory
     given = [os.path.abspath(path) for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
     ours = [path for path in sys.path[1:] if path not in given]  # the first is this file's folder

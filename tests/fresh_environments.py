@@ -13,6 +13,7 @@ import subprocess
 import sys
 import sysconfig
 import venv
+import zipfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,14 +64,20 @@ class FreshEnvironment:
     def python(self) -> Path:
         return self.prefix / "bin" / "python"
 
+    def pip_install(self, *wheels: Path) -> None:
+        """Have the environment's own pip install the wheels."""
+        subprocess.run(
+            [str(self.python), "-m", "pip", "install", "-q", "--no-deps", "--no-index", "--no-compile",
+             "--disable-pip-version-check", *map(str, wheels)],
+            check=True, capture_output=True, **self._surroundings({}),
+        )  # fmt: skip
+
     def install(self, *wheels: Path) -> None:
-        """Have the environment's own pip install the wheels; without any, do nothing."""
-        if wheels:
-            subprocess.run(
-                [str(self.python), "-m", "pip", "install", "-q", "--no-deps", "--no-index",
-                 "--disable-pip-version-check", *map(str, wheels)],
-                check=True, capture_output=True, **self._surroundings({}),
-            )  # fmt: skip
+        """Unpack wheels without scripts, as pip does, in a tenth of its time."""
+        (site,) = self.prefix.glob("lib/python*/site-packages")
+        for wheel in wheels:
+            with zipfile.ZipFile(wheel) as content:
+                content.extractall(site)
 
     def clone(self, prefix: Path) -> FreshEnvironment:
         """Make an environment with the same distributions at another place, in a tenth of the time."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -28,23 +28,27 @@ STRANGERS = sorted(p for folder in ("examples", "tests/plugins") for p in ROOT.g
 """Packages as third parties would write them."""
 
 
-def imported(path: Path, *, types: bool = False) -> Iterator[str]:
+@cache
+def imported(path: Path, *, types: bool = False) -> tuple[str, ...]:
     """Dotted names of all modules that a file imports, at any depth.
 
     types: also those under `if TYPE_CHECKING:`
     """
+    found: list[str] = []
 
-    def visit(node: ast.AST) -> Iterator[str]:
+    def visit(node: ast.AST) -> None:
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            found.extend(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+            found.extend(f"{node.module}.{alias.name}" for alias in node.names)
         typing_only = isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING")
         for child in node.orelse if typing_only and not types else ast.iter_child_nodes(node):
-            yield from visit(child)
+            if not isinstance(child, ast.expr):
+                visit(child)
 
-    return visit(ast.parse(path.read_text(encoding="utf-8")))
+    visit(ast.parse(path.read_text(encoding="utf-8")))
+    return tuple(found)
 
 
 def files_of(package: Path) -> list[Path]:

@@ -63,7 +63,18 @@ def test_this_machine_can_do_the_main_job(sound):
         assert "\n" not in check["detail"]
         assert "\n" not in (check["mend"] or "")
     checks = checks_of(done)
-    assert {"Python", "torch", "CUDA", "C++", "nvcc", "sw_rasterizers", "reference", "memory", "sw-3dgs"} <= set(checks)
+    assert {
+        "Python",
+        "torch",
+        "CUDA",
+        "C++",
+        "nvcc",
+        "sw_rasterizers",
+        "reference",
+        "memory",
+        "sw-3dgs",
+        "LPIPS package",
+    } <= set(checks)
     assert checks["sw run --method 3dgs --scene demo"]["state"] == "ok"
     assert done.stderr == ""
 
@@ -142,21 +153,16 @@ def test_checks_of_strangers_stand_beside_ours_and_harm_none(faulty):
     assert (checks["liar"]["group"], checks["liar"]["needed"]) == ("checks", False)
 
 
-@pytest.fixture
-def without_torch(tmp_path):
-    """A folder for PYTHONPATH whose torch cannot be imported, and processes that are new: others have torch."""
+def test_without_a_torch_that_imports_the_main_job_cannot_run_and_what_needs_torch_is_not_checked(tmp_path):
     (tmp_path / "torch").mkdir()
     (tmp_path / "torch" / "__init__.py").write_text("raise ImportError('libtorch.so: cannot open shared object file')")
-    with forked_children.starting():
-        yield str(tmp_path)
-
-
-def test_without_a_torch_that_imports_the_main_job_cannot_run(without_torch):
-    done = doctor(PYTHONPATH=without_torch)
+    with forked_children.starting():  # forked processes have torch
+        done = doctor(PYTHONPATH=str(tmp_path))
     assert done.returncode == 1
     assert "cannot run here" in done.stdout
     assert "libtorch.so" in done.stdout
     assert re.search(r"-> pip install --force-reinstall torch -c \S*constraints.txt", as_written(done.stdout))
+    assert "LPIPS" not in done.stdout
     assert "Traceback" not in done.stdout + done.stderr
 
 
@@ -165,12 +171,6 @@ def test_without_the_method_the_main_job_cannot_run():
     assert done.returncode == 1
     job = checks_of(done)["sw run"]
     assert (job["state"], job["detail"], job["mend"]) == ("broken", "not installed: a method", "unset SW_PLUGINS")
-
-
-def test_without_torch_a_registered_check_that_needs_it_is_left_out(without_torch):
-    checks = checks_of(doctor("--json", PYTHONPATH=without_torch))
-    assert checks["torch"]["state"] == "broken"
-    assert not any(check["group"] == "metrics" for check in checks.values())
 
 
 def test_a_gpu_without_the_package_gsplat_is_told_how_to_get_it(monkeypatch):

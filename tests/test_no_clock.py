@@ -32,7 +32,7 @@ ALLOWED = {
     "plugins/sw-doctor/tests/test_child_processes.py::test_a_process_that_dies_or_hangs_is_a_finding":
         "the clock that the limit is held against stands still until the process hangs",
     "splatwizard-core/tests/runs/test_survival.py::undisturbed": "the slow tests kill a run at parts of its time",
-    "splatwizard-native/tests/test_files.py::test_temporaries_of_another_container_stay_for_a_day":
+    "splatwizard-core/tests/base/test_files.py::test_temporaries_of_another_container_stay_for_a_day":
         "gives a file an age of two days",
     "splatwizard-native/tests/test_waiting.py::SPIN": "of a slow test",
     "splatwizard-native/tests/test_build_lock.py": "locks of one process, free or held: a limit of 0 s is the same",

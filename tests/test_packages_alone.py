@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -16,7 +16,6 @@ from splatwizard_core.coding.container import ContainerReader
 
 GOLDEN = Path(__file__).parent / "golden"
 ONE_OF_EACH_METHOD = sorted({ContainerReader.open(p).method: p for p in sorted(GOLDEN.glob("*.swz"))}.values())
-IN_DEFAULT_TESTS = {"3dgs", "chimerags"}
 ALONE_IN_DEFAULT_TESTS = {"sw-hac-plus", "sw-report"}
 """The rest is slow: that a package declares what it imports is also read off its source (test_layers)."""
 IN_EVERY_ENVIRONMENT = needed("splatwizard-core")
@@ -65,12 +64,12 @@ def providers(everything) -> dict[str, str]:
 
 
 @contextlib.contextmanager
-def uninstalled(environment: FreshEnvironment, distribution: str) -> Iterator[None]:
-    """The environment without one distribution, for a while."""
-    stem = distribution.replace("-", "_")
+def uninstalled(environment: FreshEnvironment, distributions: Iterable[str]) -> Iterator[None]:
+    """The environment without some distributions, for a while."""
     (site,) = environment.prefix.glob("lib/python*/site-packages")
-    taken = [site / stem, *site.glob(f"{stem}-*.dist-info")]
-    assert len(taken) == 2
+    stems = {distribution.replace("-", "_") for distribution in distributions}
+    taken = [path for stem in stems for path in (site / stem, *site.glob(f"{stem}-*.dist-info"))]
+    assert len(taken) == 2 * len(stems)
     away = environment.prefix / "away"
     away.mkdir()
     for path in taken:
@@ -82,24 +81,20 @@ def uninstalled(environment: FreshEnvironment, distribution: str) -> Iterator[No
 
 
 @pytest.mark.pipeline
-@pytest.mark.parametrize(
-    "path",
-    [pytest.param(p, id=p.stem, marks=[] if ContainerReader.open(p).method in IN_DEFAULT_TESTS else pytest.mark.slow)
-     for p in ONE_OF_EACH_METHOD],
-)  # fmt: skip
-def test_a_file_whose_provider_is_gone_names_it(everything, providers, path):
+def test_a_file_whose_provider_is_gone_names_it(everything, providers):
     """The header knows its packages; of older files that do not, the catalogue does."""
-    provider = providers[ContainerReader.open(path).method]
-    with uninstalled(everything, provider):
-        done = everything.run("decode", str(path), check=False)
-    assert done.returncode == 2
-    assert re.search(rf"pip install '?{provider}\b", as_written(done.stderr))
-    assert "Traceback" not in done.stderr
+    named = [providers[ContainerReader.open(path).method] for path in ONE_OF_EACH_METHOD]
+    with uninstalled(everything, named):
+        told = everything.run_each([["decode", str(path)] for path in ONE_OF_EACH_METHOD])
+    for provider, done in zip(named, told, strict=True):
+        assert done.status == 2
+        assert re.search(rf"pip install '?{provider}\b", as_written(done.stderr)), provider
+        assert "Traceback" not in done.stderr
 
 
 @pytest.mark.pipeline
 def test_a_library_that_is_gone_is_named(everything):
-    with uninstalled(everything, "sw-codecs"):
+    with uninstalled(everything, ["sw-codecs"]):
         done = everything.run("decode", str(GOLDEN / "3dgs_r3_v1.swz"), check=False)
     assert done.returncode == 2
     assert "needs sw-codecs, which is not installed: pip install sw-codecs" in as_written(done.stderr)

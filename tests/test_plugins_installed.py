@@ -29,7 +29,7 @@ def good(module: str) -> str:
 
 
 def test_a_plugin_is_listed_with_what_it_provides(core, make_plugin):
-    core.install(make_plugin("sw-good", good("sw_good"), version="1.2"))
+    core.pip_install(make_plugin("sw-good", good("sw_good"), version="1.2"))
     listed = core.plugins()["sw-good"]
     assert listed["version"] == "1.2"
     assert listed["error"] is None

@@ -32,7 +32,7 @@ SHORT = {
     # The opacity that keeps an anchor is raised, or none of them would have gone after so few steps.
     "test-anchors": ("iterations=50", "min_opacity=0.99", "log_every=1"),
 }
-STEPS = 60
+STEPS = 30
 INTERRUPTED = {
     "test-distill": (1, ("base_iterations=10", f"iterations={STEPS}", "log_every=1")),
     "test-anchors": (0, (f"iterations={STEPS}", "adjust_interval=10", "grad_threshold=5e-3", "log_every=1")),
@@ -44,7 +44,7 @@ from splatwizard_core.api import hookimpl
 
 class Brake:
     def after_step(self, model, record):
-        if record.step == {STEPS} - 10:
+        if record.step == {STEPS} - 5:
             time.sleep(3600)
 
     def finished(self):
@@ -117,7 +117,7 @@ def test_an_interrupted_training_goes_on_and_ends_as_an_uninterrupted_one(strang
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     strangers.sw("train", *arguments(method, whole, sets))
     with strangers.start("train", *arguments(method, broken, sets), TEST_BRAKE="1") as process:
-        while process.poll() is None and not any(x["stage"] == stage and x["step"] > 20 for x in log_of(broken)):
+        while process.poll() is None and not any(x["stage"] == stage and x["step"] > 12 for x in log_of(broken)):
             time.sleep(0.01)
         process.send_signal(signal.SIGINT)
         _, told = process.communicate()

@@ -130,13 +130,14 @@ def file_of(site, name):
 
 @pytest.mark.parametrize("name", ["chosen", "points"])
 def test_parts_by_name_write_a_file_that_a_fresh_process_decodes(site, records, name):
-    info = json.loads(site.sw("info", file_of(site, name), "--json").stdout)
+    file = str(file_of(site, name))
+    info, decoded = (
+        json.loads(done.stdout) for done in site.sw_each([[c, file, "--json"] for c in ("info", "decode")])
+    )
     assert info["static"]["entropy"] == "zipped"
     assert info["static"]["positions"] == "plain-points"
     assert info["requires"]["sw-parts"] == "0.1"
-    assert (
-        json.loads(site.sw("decode", file_of(site, name), "--json").stdout)["digest"] == records[name]["file"]["digest"]
-    )
+    assert decoded["digest"] == records[name]["file"]["digest"]
 
 
 def test_the_usual_parts_are_not_named(site, records):
@@ -155,25 +156,21 @@ def test_a_part_that_is_not_there_is_told_with_its_package(site, records, tmp_pa
     assert "pip install 'sw-parts>=0.1' (the package that the file names)" in done.stderr
 
 
-@pytest.mark.parametrize(
-    ("part", "name", "said"),
-    [
-        ("entropy", "zippd", "no entropy model is called 'zippd'; did you mean 'zipped'?"),
-        ("entropy", "categorical", "entropy model 'categorical' of sw-codecs"),
-        (
-            "entropy",
-            "zipped-badly",
-            "entropy model 'zipped-badly' of sw-parts 0.1 cannot serve as codec.settings.entropy",
-        ),
-        ("positions", "zipped", "no coder is called 'zipped'"),
-        ("positions", "huffman", "coder 'huffman' does not code positions"),
-    ],
-)
-def test_a_part_that_cannot_serve_is_told_before_anything_is_trained(site, part, name, said):
-    words = ("train", "--method", "3dgs", "--rate", "r3", *SHORT[:-1], "--set", f"codec.settings.{part}={name}")
-    done = site.sw(*words, "--out", "none", check=False)
-    assert done.returncode == 2
-    assert said in done.stderr
+REFUSED = [
+    ("entropy", "zippd", "no entropy model is called 'zippd'; did you mean 'zipped'?"),
+    ("entropy", "categorical", "entropy model 'categorical' of sw-codecs"),
+    ("entropy", "zipped-badly", "entropy model 'zipped-badly' of sw-parts 0.1 cannot serve as codec.settings.entropy"),
+    ("positions", "zipped", "no coder is called 'zipped'"),
+    ("positions", "huffman", "coder 'huffman' does not code positions"),
+]
+
+
+def test_a_part_that_cannot_serve_is_told_before_anything_is_trained(site):
+    words = ["train", "--method", "3dgs", "--rate", "r3", *SHORT[:-1], "--out", "none"]
+    told = site.sw_each([[*words, "--set", f"codec.settings.{part}={name}"] for part, name, _ in REFUSED])
+    for (_, name, said), done in zip(REFUSED, told, strict=True):
+        assert done.status == 2, name
+        assert said in done.stderr
     assert not list((site.folder / "none").glob("**/checkpoints"))
 
 
@@ -197,15 +194,20 @@ def test_files_of_other_methods_take_parts_by_name_too(site, method):
     small = () if method == "gaussians-zstd" else ("--set", "codec.settings.iterations=3")
     usual = json.loads(site.sw("run", *words, *small, *SHORT, "--out", "others").stdout)["runs"][0]
     chosen = [word for key, name in parts.items() for word in ("--set", f"{key}={name}")]
-    site.sw("encode", usual["directory"], *chosen, "--out", "chosen.swz", "--no-psnr")
-    info = json.loads(site.sw("info", "chosen.swz", "--json").stdout)
+    badly = {"codec.settings.entropy": "zipped-badly", "codec.settings.means": "no-floats", "arrays": "no-floats"}
+    badly = {key: name for key, name in badly.items() if key in parts}
+    encode, same = ["encode", usual["directory"]], f"{usual['directory']}/scene.swz"
+    _, *shown, decoded = site.sw_each([
+        [*encode, *chosen, "--out", "chosen.swz", "--no-psnr"],
+        *(["info", file, "--json"] for file in ("chosen.swz", same)),
+        *([*encode, "--set", f"{key}={name}", "--out", "no.swz"] for key, name in badly.items()),
+        ["decode", "chosen.swz", "--json"],
+    ])  # fmt: skip
+    info, plain = (json.loads(done.stdout) for done in shown[:2])
     assert info["requires"]["sw-parts"] == "0.1"
     assert info["static"]["arrays"] == "plain-arrays"
-    assert "sw-parts" not in json.loads(site.sw("info", f"{usual['directory']}/scene.swz", "--json").stdout)["requires"]
-    decoded = json.loads(site.sw("decode", "chosen.swz", "--json").stdout)
-    assert decoded["digest"] == usual["record"]["file"]["digest"]  # the parts lose nothing
-    badly = {"codec.settings.entropy": "zipped-badly", "codec.settings.means": "no-floats", "arrays": "no-floats"}
-    for key in badly.keys() & parts.keys():
-        done = site.sw("encode", usual["directory"], "--set", f"{key}={badly[key]}", "--out", "no.swz", check=False)
-        assert done.returncode == 2
-        assert f"'{badly[key]}' of sw-parts 0.1 cannot serve as {key}" in done.stderr
+    assert "sw-parts" not in plain["requires"]
+    assert json.loads(decoded.stdout)["digest"] == usual["record"]["file"]["digest"]  # the parts lose nothing
+    for (key, name), done in zip(badly.items(), shown[2:], strict=True):
+        assert done.status == 2
+        assert f"'{name}' of sw-parts 0.1 cannot serve as {key}" in done.stderr

@@ -199,11 +199,11 @@ def test_info_of_a_file_that_can_be_decoded_misses_nothing(capsys):
 
 @pytest.mark.pipeline
 def test_really_missing_packages(core, wheels, tmp_path):
-    """Without any plugin, then with one whose own requirement is missing, then with everything."""
+    """Without any plugin, and with one whose own requirement is missing."""
     path = write(tmp_path)
-    assert "positions" in core.run("info", str(path)).stdout
-    done = core.run("decode", str(path), check=False)
-    assert done.returncode == 2
+    told, done = core.run_each([["info", str(path)], ["decode", str(path)]])
+    assert "positions" in told.stdout
+    assert done.status == 2
     assert "pip install 'sw-3dgs>=0.1.0' (the package that the file names)" in as_written(done.stderr)
     command = re.search(r"(\S+ (?:-m pip )?install --find-links \S+ '[^']+')", done.stderr)
     assert command is not None
@@ -212,9 +212,6 @@ def test_really_missing_packages(core, wheels, tmp_path):
     done = core.run("decode", str(path), check=False)
     assert done.returncode == 2
     assert f"sw-3dgs {HERE} does not load: needs " in done.stderr
-    core.install(*(wheels[f"sw-{name}"] for name in ("codecs", "gaussians", "rasterizers", "reference")))
-    decoded = json.loads(core.run("decode", str(path), "--repeats", "0", "--json").stdout)
-    assert decoded["counts"] == {"num_gaussians": 48}
 
 
 def test_a_part_that_the_user_left_out_is_told_to_be_left_out(capsys, only):

@@ -41,7 +41,7 @@ Pre   | measure rate model               | range(15501, 17000, 100)
 Pre   | fix integers                     | 17000
 Post  | remove by rate and distortion    | range(2500, 10501, 1000)"""
 
-SHORT = {"iterations": 90, "scale_schedule": True, "prune.every": 4_000, "context.rebuild": 1_000}
+SHORT = {"iterations": 90, "scale_schedule": True, "prune.every": 4_000, "context.rebuild": 1_000, "context.fit": 20}
 
 
 def configured(plugins, **values):

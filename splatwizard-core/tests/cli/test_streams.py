@@ -36,8 +36,7 @@ def encoded(tmp_path: Path) -> str:
 
 @pytest.mark.parametrize(
     ("command", "closed"),
-    [("info {file}", ">&-"), ("info {file}", "2>&-"), ("info {file}", "<&-"), ("info {file}", ">&- 2>&- <&-"),
-     ("list-plugins --json", ">&- 2>&- <&-"), ("--help", ">&- 2>&- <&-")],
+    [("list-plugins", ">&-"), ("list-plugins", "2>&-"), ("list-plugins", "<&-"), ("info {file}", ">&- 2>&- <&-")],
 )  # fmt: skip
 def test_closed_streams_are_no_error(command: str, closed: str, encoded: str):
     done = in_shell(f"{SW} {command.format(file=encoded)} {closed}")
@@ -68,7 +67,7 @@ def test_a_terminal_gets_no_orders_from_a_file(tmp_path: Path, capsys: pytest.Ca
 
 
 def test_an_error_with_closed_streams_still_has_its_status(tmp_path: Path):
-    done = in_shell(f"{SW} info {shlex.quote(str(tmp_path))}/absent.swz >&- 2>&-")
+    done = in_shell(f"{SW} list-plugins {shlex.quote(str(tmp_path))} >&- 2>&-")
     assert (done.returncode, done.stdout, done.stderr) == (2, "", "")
 
 
@@ -82,10 +81,10 @@ def test_a_closed_stream_is_not_taken_by_the_next_file(encoded: str, tmp_path: P
     assert b"views" not in written
 
 
-@pytest.mark.parametrize("command", ["info {file}", "list-plugins", "list-plugins --json", "--help"])
-def test_a_reader_that_stops_reading_ends_a_command_quietly(command: str, encoded: str):
+@pytest.mark.parametrize("command", ["list-plugins", "list-plugins --json", "--help"])
+def test_a_reader_that_stops_reading_ends_a_command_quietly(command: str):
     # The reader is gone before anything is written.
-    done = in_shell(f"(exec 3>&1; {SW} {command.format(file=encoded)}; echo $? >&2) | true")
+    done = in_shell(f"(exec 3>&1; {SW} {command}; echo $? >&2) | true")
     assert done.stderr.strip() == "141"
 
 

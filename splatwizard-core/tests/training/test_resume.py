@@ -35,7 +35,7 @@ def whole(toy, trained_once):
     return outcome
 
 
-@pytest.mark.parametrize("stop", [1, 44, 45, 100, 199])
+@pytest.mark.parametrize("stop", [44, 45, 199])
 def test_stopped_and_resumed_equals_one_go(toy, whole, tmp_path, stop):
     with pytest.raises(TrainingStopped):
         toy.train(iterations=200, directory=tmp_path, stop_after=stop)

@@ -122,7 +122,7 @@ def test_stages_follow_each_other_and_are_told_apart(make):
     assert outcome.plan[1].tasks == []
 
 
-@pytest.mark.parametrize("stop", [1, 59, 60, 61, 99, 100, 101, 129])
+@pytest.mark.parametrize("stop", [59, 60, 61, 100])
 def test_resuming_in_any_stage_equals_one_go(make, tmp_path, stop):
     expected = make()
     with pytest.raises(TrainingStopped):

@@ -9,10 +9,11 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
+from functools import cache
 from pathlib import Path
 from urllib.parse import quote
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 
 from splatwizard_core.tooling import as_installed, write_atomic
@@ -87,19 +88,12 @@ def render_page(collection: Collection, options: PageOptions, folder: Path | Non
     runs = collection.runs
     single = len(runs) == 1 and not runs[0].repeats
     sections = _single_sections(runs[0], options) if single else _many_sections(runs, options)
-    environment = Environment(
-        loader=PackageLoader("sw_report"), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-        # Advice as the terminal gives it; what is marked up already is ours.
-        finalize=lambda value: as_installed(value) if type(value) is str else value,
-    )  # fmt: skip
-    environment.filters["unbroken"] = _unbroken
-    environment.filters["capfirst"] = lambda text: text[:1].upper() + text[1:]
-    loader = environment.loader
+    template = page_template()
+    loader = template.environment.loader
     assert loader is not None
-    style, script = (loader.get_source(environment, name)[0] for name in ("style.css", "script.js"))
+    style, script = (loader.get_source(template.environment, name)[0] for name in ("style.css", "script.js"))
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
-    return environment.get_template("page.html.j2").render(
+    return template.render(
         title=_title(runs),
         lede=_lede(runs),
         date=datetime.now(timezone.utc).strftime("%d %B %Y").lstrip("0"),
@@ -115,6 +109,20 @@ def render_page(collection: Collection, options: PageOptions, folder: Path | Non
         gain=GAIN,
         side=LONGEST_SIDE if single else LONGEST_SIDE_OF_MANY,
     )
+
+
+@cache
+def page_template() -> Template:
+    """The page's template, compiled once in a process."""
+    environment = Environment(
+        loader=PackageLoader("sw_report"), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+        # Advice as the terminal gives it; what is marked up already is ours.
+        finalize=lambda value: as_installed(value) if type(value) is str else value,
+    )  # fmt: skip
+    environment.filters["unbroken"] = _unbroken
+    environment.filters["capfirst"] = lambda text: text[:1].upper() + text[1:]
+    return environment.get_template("page.html.j2")
 
 
 def scene_links(runs: Sequence[Run], folder: Path) -> list[tuple[str, str]]:
