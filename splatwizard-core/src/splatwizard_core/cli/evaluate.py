@@ -25,7 +25,7 @@ from splatwizard_core.plugins import load_plugins
     shared.scene_option, shared.images_option, shared.config_option, shared.set_option,
     click.option(
         "--metrics", metavar="NAME[,NAME]", type=name_of("metric"),
-        help="Which metrics.  [default: every one over images that is installed]",
+        help="Which metrics.  [default: all over images that are installed, but slow diagnostics]",
     ),
     click.option(
         "--renders", metavar="DIR", type=OUTPUT_FOLDER,

@@ -170,7 +170,7 @@ def evaluate(
     device      where the model is
     options     as `render_options` makes them; their background is also that of RGBA pictures
     quantize8   round renders to 8 bit before comparing; a metric declared with `unrounded` never gets rounded ones
-    metrics     names from the registry; None: every one that is installed
+    metrics     names from the registry; None: the usual ones that are installed
     metric_settings     of metrics, group -> key -> value
     save_to     folder for the renders as PNG, named after the views; None: they are not kept
 

@@ -63,7 +63,7 @@ def measure(
 
     resolved    with the scene, the settings of metrics, and the choice of rasterizers
     open_model  () -> the model on the session's device; called first, before any picture is read
-    metrics     names; None: all over images that are installed, and PSNR over the training views where `eval_train`
+    metrics     names; None: the usual ones over images, and PSNR over the training views where `eval_train`
                 asks for it; with `geometry` all over models besides
     speed       also measure speed and memory
     repeats     how often speed is measured
