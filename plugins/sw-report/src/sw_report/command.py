@@ -48,8 +48,8 @@ def _columns(_context: click.Context, _parameter: click.Parameter, incomplete: s
     click.option("--json", "form", flag_value="json", help="Print one JSON object: runs, means, BD values, notes."),
     click.option("--jsonl", "form", flag_value="jsonl", help="Print one JSON object a run."),
     click.option("--columns", metavar="NAME[,NAME]", shell_complete=_columns,
-                 help="Columns of the tables: method, rate, scenes, seeds, psnr, ssim, lpips (or any metric), size, "
-                 "primitives, steps, train, encode, decode, fps; `all`, or `paper`: method, rate, psnr, ssim, lpips, "
+                 help="Columns of the tables: method, rate, scenes, seeds, psnr, ssim, lpips (or any metric of the records, "
+                 "diagnostic ones too), size, primitives, steps, train, encode, decode, fps; `all`, or `paper`: method, rate, psnr, ssim, lpips, "
                  "size.  [default: paper with --latex, else all]"),
     click.option("--anchor", metavar="METHOD", type=name_of("method"),
                  help="What BD-rates compare against.  [default: the most usual "
@@ -81,7 +81,7 @@ def report(
     from sw_report import exports
     from sw_report.distortion import bd_tables, choose_anchor, why_no_values
     from sw_report.runs import collect
-    from sw_report.selection import PAPER, chosen_columns, selected
+    from sw_report.selection import PAPER, chosen_columns, names_columns, selected
 
     if columns is not None and form in ("csv", "json", "jsonl"):
         raise click.UsageError(f"--columns is for tables; --{form} has all values")
@@ -111,7 +111,9 @@ def report(
     elif form == "json":
         print_json(exports.to_dict(collection, anchor=against, partial=partial, pareto=pareto))
     elif form is not None or (html is None and survey is None and plots is None):
-        tables = exports.tables_of(collection, anchor=against, partial=partial, pareto=pareto)
+        tables = exports.tables_of(
+            collection, anchor=against, partial=partial, pareto=pareto, diagnostic=names_columns(columns)
+        )
         wanted = chosen_columns(columns, [t for _, t in tables], default=PAPER if form == "latex" else None)
         tables = [(title, selected(table, wanted)) for title, table in tables]
         if form == "latex":
