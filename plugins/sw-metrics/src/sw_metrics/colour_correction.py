@@ -106,6 +106,8 @@ def solved(gram: Tensor, moments: Tensor) -> Tensor:
 def cc_psnr(render: Tensor, truth: Tensor) -> float:
     """PSNR in dB, joint over channels, of the affinely corrected render, which is not rounded again."""
     check_pair(render, truth)
+    if not truth.numel():  # nothing is inside a mask
+        return math.nan
     if torch.equal(render, truth):
         return math.inf
     A, b = fitted(render, truth)

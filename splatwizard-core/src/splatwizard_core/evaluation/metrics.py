@@ -48,6 +48,7 @@ class MetricInfo:
     diagnostic  computed to tell conventions apart, not for tables
     slow        left out of evaluations during a training; a slow diagnostic is computed only where it is named
     unrounded   gets the render as it is, not rounded to 8 bit
+    pixelwise   gets pictures [3,1,n] of the pixels inside the mask, where the protocol cuts pictures out
     settings    "module:Model", the pydantic model of its settings; empty: it has none
     over        "image"; or "views" (where they lie) and "model": (Subject) -> MetricResult, None: does not apply
     """
@@ -60,6 +61,7 @@ class MetricInfo:
     diagnostic: bool = False
     slow: bool = False
     unrounded: bool = False
+    pixelwise: bool = False
     settings: str = ""
     over: str = "image"
 

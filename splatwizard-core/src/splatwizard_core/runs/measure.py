@@ -116,7 +116,7 @@ def measure(
     result = quality.evaluate(
         model, views, rasterizer, plugins,
         device=device, options=options, quantize8=scene.protocol.quantize8, metrics=metrics,
-        metric_settings=resolved.metrics, save_to=renders,
+        metric_settings=resolved.metrics, masked=scene.protocol.masked, save_to=renders,
         label=f"evaluate on {scene.name}",
     )  # fmt: skip
     setup = MetricSetup(device, resolved.metrics)
@@ -177,14 +177,9 @@ def _environment(plugins: PluginManager, device: torch.device, seed: int) -> dic
 
 
 def _flags(
-    scene: Scene,
-    result: quality.EvaluationResult,
-    meter: MemoryMeter,
-    *,
-    device_bound: bool,
-    bad_rows: int,
+    scene: Scene, result: quality.EvaluationResult, meter: MemoryMeter, *, device_bound: bool, bad_rows: int,
     contended: bool,
-) -> list[str]:
+) -> list[str]:  # fmt: skip
     """Name the circumstances that a reader of the numbers must know."""
     told = {
         "fit": scene.protocol.split == "all",
