@@ -26,10 +26,14 @@ from sw_report.runs import Run
 
 HEADING = "How far from the training views it holds"
 DISTANCE = "path_combined"
-DISTANCE_LABEL = "distance / scene extent + angle / 90° to the nearest training view"
-SHORT_LABEL = "distance / extent + angle / 90°"
+DISTANCE_LABEL = "distance / extent + angle / 90°"
 GROUPS = 4
 FEWEST_RANKED = 8  # views, below which a rank correlation says nothing
+EXPLAINED = (
+    "Test views in four groups of equal size, by their distance from the nearest training view (distance / scene "
+    "extent + angle / 90°). Fall: the nearest group's mean less the farthest's. Rank correlation (Spearman): of that "
+    f"distance and PSNR, −1 where each farther view is worse; a dash with fewer than {FEWEST_RANKED} views."
+)
 MOST_LINES = 8
 NEAR_TO_FAR = ("nearest", "2nd quarter", "3rd quarter", "farthest")
 
@@ -106,14 +110,8 @@ def distance_table(runs: Sequence[Run]) -> Table:
             rank = numbers.MISSING if found.rank is None else numbers.signed(found.rank)
             rows.append(row([run.label, *(numbers.score("psnr", value) for _, value in found.groups),
                              numbers.signed(found.fall), rank]))  # fmt: skip
-    distances = reached(runs[0], DISTANCE)
-    told = "" if distances is None else ", ".join(f"{mean:.2f}" for mean, _ in distances.groups)
-    notes = [
-        f"Test views in four groups of equal size, by {DISTANCE_LABEL}"
-        f"{f'; means of the groups: {told}' if told else ''}.",
-        "Fall: the nearest group's mean less the farthest's. Rank correlation (Spearman): of that distance and PSNR, "
-        f"−1 where each farther view is worse; a dash with fewer than {FEWEST_RANKED} views.",
-    ]
+    groups = reached(runs[0], DISTANCE)
+    notes = [f"Mean distance of the groups: {', '.join(f'{mean:.2f}' for mean, _ in groups.groups)}."] if groups else []
     return Table("PSNR by distance from the training views", heads, rows, notes=notes, sortable=True)
 
 
@@ -167,7 +165,7 @@ def distance_parts(runs: Sequence[Run], style_of: dict[str, int]) -> list[Part]:
     charts = distance_charts(known, style_of) if known else None
     if charts is None:
         return []
-    return [Part(HEADING, charts=charts), Part(table=distance_table(known))]
+    return [Part(HEADING, EXPLAINED, charts=charts), Part(table=distance_table(known))]
 
 
 def sheet_section(runs: Sequence[Run], style_of: dict[str, int]) -> Section:
@@ -194,4 +192,4 @@ def sheet_section(runs: Sequence[Run], style_of: dict[str, int]) -> Section:
             "which measures path_combined"
         )
     charts = Charts(figures, [(key, name) for name, key in legend.items()])
-    return Section("distance", "PSNR by distance from the training views", [Part(charts=charts), *tables])
+    return Section("distance", "PSNR by distance from the training views", [Part(charts=charts), *tables], EXPLAINED)

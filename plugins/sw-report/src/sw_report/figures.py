@@ -14,7 +14,7 @@ from splatwizard_core.tooling import write_atomic
 from sw_report import numbers
 from sw_report.aggregate import DatasetTable, dataset_tables
 from sw_report.charts import STYLES
-from sw_report.distance import SHORT_LABEL, reached, with_distances
+from sw_report.distance import DISTANCE_LABEL, reached, with_distances
 from sw_report.distortion import drawn_metrics
 from sw_report.method_styles import styles_of
 from sw_report.plots import counts_anchors
@@ -27,18 +27,23 @@ if TYPE_CHECKING:
 
 FORMS = ("svg", "pdf")
 MARKERS = "os^DvPh*"  # in the order of `charts.MARKERS`
+DASHES = ("-", "--", "-.", ":")
 PANEL = (3.4, 2.6)  # inches: half of a page of two columns
 SALT = "splatwizard"  # equal curves make equal files
 
 
 @dataclass(frozen=True)
 class Line:
-    """Curve of one method: (megabytes or distance, value, standard deviation over the seeds or None), by the first."""
+    """Curve of one method: (megabytes or distance, value, standard deviation over the seeds or None), by the first.
+
+    dash    pattern of the line where it is not `dashed`, any number: for lines of one colour
+    """
 
     name: str
     points: Sequence[tuple[float, float, float | None]]
     style: int
     dashed: bool = False
+    dash: int = 0
 
 
 @dataclass(frozen=True)
@@ -151,10 +156,11 @@ def _of_distances(runs: Sequence[Run], styles: dict[str, int]) -> list[Panel]:
     panels = []
     for metric in drawn_metrics(runs):
         lines = [
-            Line(run.label, [(x, y, None) for x, y in found.groups], styles[run.variant])
-            for run in runs if (found := reached(run, metric)) is not None
+            Line(run.label, [(x, y, None) for x, y in found.groups], styles[run.variant],
+                 dash=sum(run.variant == other.variant for other in runs[:i]))
+            for i, run in enumerate(runs) if (found := reached(run, metric)) is not None
         ]  # fmt: skip
-        panels += [Panel(numbers.heading(metric), lines, SHORT_LABEL)] if lines else []
+        panels += [Panel(numbers.heading(metric), lines, DISTANCE_LABEL)] if lines else []
     return panels
 
 
@@ -187,7 +193,8 @@ def _draw(figure: Figure, panels: Sequence[Panel]) -> None:
             marker = MARKERS[(line.style + line.style // STYLES) % len(MARKERS)]
             style: dict[str, Any] = {
                 "color": colours[line.style % STYLES], "marker": marker,
-                "markersize": 4.5, "linewidth": 1.3, "linestyle": "--" if line.dashed else "-",
+                "markersize": 4.5, "linewidth": 1.3,
+                "linestyle": "--" if line.dashed else DASHES[line.dash % len(DASHES)],
             }  # fmt: skip
             (handles[line.name],) = axes.plot(x, y, **style)
             if any(deviation is not None for deviation in deviations):
