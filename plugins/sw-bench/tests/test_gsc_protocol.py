@@ -15,7 +15,9 @@ import pytest
 import torch
 from sw_bench.gsc import TITLE, coding, protocol
 from sw_bench.gsc.coding import CodecFailedError
+from sw_bench.gsc.frames import frame_files, joined
 from sw_bench.gsc.protocol import sequence_names
+from sw_bench.gsc.tables import PARTS
 from sw_bench.gsc.views import Asked, camera_hash, size_of, views_of
 from sw_gaussians.ply import export_ply
 from sw_interchange.ply_cameras import PlyCamera, ply_camera_comments
@@ -137,6 +139,59 @@ def photographs(folder: Path) -> Path:
         text = json.dumps({"camera_angle_x": 0.9, "frames": frames})
         (folder / "white" / f"transforms_{part}.json").write_text(text)
     return folder / "white"
+
+
+def test_frames_are_one_sequence_seen_from_one_place(tmp_path: Path, capsys, files, in_this_process):
+    for i in (9, 10):
+        export_ply(model_of(seed=i, n=100 + i), tmp_path / f"dance{i:03d}.ply")
+    words = ("--frames", tmp_path / "dance%03d.ply", "--cameras", files[1], "--method", "splat", "-o", "anchor=splat")
+    facts = bench(capsys, *words, "--out", tmp_path / "out")
+    ((source,), (row,)) = facts["sources"], facts["rows"]
+    alone = [bench(capsys, tmp_path / f"dance{i:03d}.ply", *words[2:], "--out", tmp_path / f"{i}")["rows"][0]
+             for i in (9, 10)]  # fmt: skip
+    assert [each["file"] for each in source["frames"]] == ["dance009.ply", "dance010.ply"]
+    assert (row["sequence"], row["frames"], row["splats_source"]) == ("dance", 2, 219)
+    assert row["bytes"] == alone[0]["bytes"] + alone[1]["bytes"]
+    assert row["kbps"] == pytest.approx(8 * row["bytes"] * 30 / 2000)
+    assert row["psnr_rgb"] == pytest.approx((alone[0]["psnr_rgb"] + alone[1]["psnr_rgb"]) / 2)
+    assert [view["frame"] for view in row["per_view"]] == [0, 0, 1, 1]
+    of_one = alone[0]["protocol"].partition("/")
+    assert row["protocol"].partition("/")[2] == of_one[2]
+    assert row["protocol"].partition("/")[0] != of_one[0]
+
+
+def test_frames_are_numbered_without_a_gap(tmp_path: Path):
+    for name in ("f0008.ply", "f0010.ply", "f9.ply", "f0009.txt"):
+        (tmp_path / name).touch()
+    with pytest.raises(UserInputError, match="frame 9 is missing"):
+        frame_files(str(tmp_path / "f%04d.ply"))
+    (tmp_path / "f0009.ply").touch()
+    assert [file.name for file in frame_files(str(tmp_path / "f%04d.ply"))] == ["f0008.ply", "f0009.ply", "f0010.ply"]
+    for pattern, told in (("f%04d%d.ply", "give one %d"), ("g%d.ply", "no such file")):
+        with pytest.raises(UserInputError, match=told):
+            frame_files(str(tmp_path / pattern))
+
+
+def test_a_sequence_is_as_good_as_all_its_frames():
+    view = {"psnr_rgb": 30.0, "psnr_yuv": 31.0, "ssim_yuv": 0.9, "om_psnr_rgb": None, "om_ssim_yuv": None,
+            "occupancy": 50.0, "mse_rgb": 1.0, "mse_yuv": 1.0}  # fmt: skip
+    row = {"codec": "c", "rate": "r1", "splats_source": 4, "splats_decoded": 4, "bytes": 10, "flags": "", "views": 1,
+           "enc_s": 1.0, "dec_s": 2.0, "rss_enc_mb": 5.0, "rss_dec_mb": 6.0, "per_view": [view],
+           **{f"bytes_{part}": None for part in PARTS}}  # fmt: skip
+    rows = [row | {"protocol": "gsc-aa/x/range-auto:position"}, row | {"protocol": "gsc-bb/x/range-auto:scale",
+            "rss_enc_mb": 9.0, "flags": "sh-dropped"}]  # fmt: skip
+    found = joined("s", rows)
+    assert (found["bytes"], found["enc_s"], found["rss_enc_mb"], found["flags"]) == (20, 2.0, 9.0, "sh-dropped")
+    assert (found["bits_per_splat"], found["views"], found["bytes_sh0"]) == (20.0, 1, None)
+    assert re.fullmatch(r"gsc-[0-9a-f]{8}/x/range-auto:position\+scale", found["protocol"])
+    lost = joined("s", [rows[0], rows[1] | {"bytes": None, "flags": "failed", "reason": "no memory"}])
+    assert (lost["bytes"], lost["flags"], lost["reason"]) == (None, "failed", "frame 2 of 2: no memory")
+
+
+def test_an_opacity_limit_that_no_rasterizer_here_has_is_refused(tmp_path: Path, capsys, files):
+    words = ["bench", "--protocol", "mpeg-gsc", str(files[0]), "--cameras", str(files[1]), "--device", "cpu"]
+    assert main([*words, "-o", "alpha_max=0.999", "--out", str(tmp_path)]) == 2
+    assert "opacity limit of 0.999" in capsys.readouterr().err
 
 
 def test_a_codec_that_fails_has_a_row_without_values(tmp_path: Path, capsys, files, in_this_process, monkeypatch):

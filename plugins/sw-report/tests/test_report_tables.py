@@ -16,6 +16,7 @@ from sw_report.results_tables import (
 )
 from sw_report.runs import collect
 
+from splatwizard_core.cli.main import main
 from splatwizard_core.errors import UserInputError
 
 
@@ -377,6 +378,19 @@ def test_diagnostic_metrics_stand_in_no_table_even_of_records_that_do_not_say_so
     heads = [column.name for table in (runs_table(runs), means_table(means)) for column in table.columns]
     assert not {"psnr_unrounded", "their_check"} & set(heads)
     assert bd_metrics(runs) == ["psnr", "ssim"]
+
+
+def test_a_diagnostic_metric_is_a_column_where_it_is_named(make_run, tmp_path, capsys):
+    for scene, value in (("a", 30.0), ("b", 31.0)):
+        make_run(scene=scene, change=lambda content, value=value: content["metrics"].update(
+            cc_psnr={"mean": value, "per_view": [], "direction": "higher", "diagnostic": True}))  # fmt: skip
+    assert main(["report", str(tmp_path), "--markdown", "--columns", "rate,cc_psnr"]) == 0
+    told = capsys.readouterr().out
+    assert [line for line in told.splitlines() if line.startswith("| toy")] == [
+        "| toy | r1 | 30.0000 |", "| toy | r1 | 31.0000 |", "| toy | r1 | 30.5000 |",
+    ]  # fmt: skip
+    assert main(["report", str(tmp_path), "--markdown", "--columns", "all"]) == 0
+    assert "cc_psnr" not in capsys.readouterr().out
 
 
 def test_the_anchor_is_one_whose_curve_overlaps_and_it_is_said(make_curve, tmp_path):

@@ -114,6 +114,27 @@ def test_a_metric_for_unrounded_renders_gets_them(monkeypatch: pytest.MonkeyPatc
     assert not result.metrics["l1"].diagnostic
 
 
+def pixels_seen(render: torch.Tensor, truth: torch.Tensor) -> float:
+    assert render.shape == truth.shape
+    return float(render.shape[1] * render.shape[2])
+
+
+def test_a_pixelwise_metric_gets_what_is_inside_the_mask_where_the_protocol_cuts_pictures_out():
+    own = Metrics()
+    own.metrics.add("inside", f"{__name__}:pixels_seen", summary="", direction="higher", pixelwise=True)
+    own.metrics.add("whole", f"{__name__}:pixels_seen", summary="", direction="higher")
+    found = {}
+    for masked in (False, True):
+        pictures = views(128)
+        pictures[0].load_mask = lambda: np.arange(64).reshape(8, 8) < 10
+        result = evaluate(
+            FlatModel(), pictures, FlatRasterizer(), own,  # type: ignore[arg-type]
+            device=torch.device("cpu"), options=RasterOptions(background=torch.full((3,), 0.5)), masked=masked,
+        )  # fmt: skip
+        found[masked] = {name: metric.mean for name, metric in result.metrics.items() if name in ("inside", "whole")}
+    assert found == {False: {"inside": 64, "whole": 64}, True: {"inside": 10, "whole": 64}}
+
+
 def no_weights(render: torch.Tensor, truth: torch.Tensor) -> float:
     raise CapabilityError("weights missing")
 

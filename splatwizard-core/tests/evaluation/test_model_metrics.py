@@ -67,6 +67,14 @@ def test_they_are_asked_only_for_geometry_or_by_name(registry):
         names(["nothing"], geometry=False)
 
 
+def test_a_slow_diagnostic_is_measured_only_where_it_is_named(registry):
+    for name, declared in (("costly", {"slow": True, "diagnostic": True}), ("slow", {"slow": True})):
+        registry._entries[name] = Entry("metric", name, f"{__name__}:picture", "", declared, "sw-toy", "1.0")
+    assert [e.name for e in chosen_metrics(registry, None, geometry=False)] == ["psnr", "slow"]
+    assert [e.name for e in chosen_metrics(registry, ["costly"], geometry=False)] == ["costly"]
+    assert quick_metrics(registry) == ["psnr"]
+
+
 def test_one_that_breaks_costs_its_own_value_alone(registry):
     found = evaluate_model(SimpleNamespace(), chosen_metrics(registry, None, geometry=True))
     assert "psnr" not in found

@@ -62,6 +62,8 @@ from splatwizard_core.tooling import (
                  "scene's test views, else all]"),
     click.option("--size", metavar="WxH", help="With --protocol: of pictures from cameras without a size.  [default: "
                  "1280x720]"),
+    click.option("--frames", metavar="PATTERN", help="With --protocol: the frames of one sequence, 'f%04d.ply', each "
+                 "coded alone, in place of FILE...  [default: none]"),
     json_option, debug_option,
 )  # fmt: skip
 def bench(paths: tuple[str, ...], train_shared: tuple[str, str] | None, **given: Any) -> None:
@@ -72,9 +74,9 @@ def bench(paths: tuple[str, ...], train_shared: tuple[str, str] | None, **given:
 
     With --protocol mpeg-gsc, FILE... are trained models, and --method names codecs (default: all that train nothing).
     Further -o KEY=VALUE: anchor, path (auto, orbit16, inside16), up (x,y,z or auto), quaternion (w2c, c2w), range
-    (auto, fixed). Written are gsc.csv, gsc_bd.csv and gsc.json.
+    (auto, fixed), alpha_max (0.99, 0.999). Written are gsc.csv, gsc_bd.csv and gsc.json.
     """
-    of_protocol = {name: given.pop(name) for name in ("protocol", "cameras", "views", "size")}
+    of_protocol = {name: given.pop(name) for name in ("protocol", "cameras", "views", "size", "frames")}
     if of_protocol.pop("protocol") is not None:
         from sw_bench.gsc.command import bench_models
 

@@ -19,4 +19,5 @@ def register_rasterizers(registry: Registry) -> None:
         profiles=["3dgs"],
         exactness="tight",
         speed=40,
+        alpha_max=0.999,
     )  # fmt: skip

@@ -37,7 +37,8 @@ def register_metrics(registry: Registry) -> None:
         ("cc_ssim", "SSIM, colour-corrected", "", 4, "higher", "ssim after colours are fitted to the photograph"),
     ):  # fmt: skip
         registry.add(name, f"sw_metrics.colour_correction:{name}", label=label, unit=unit, digits=digits,
-                     direction=direction, diagnostic=True, slow=True, summary=summary)  # fmt: skip
+                     direction=direction, diagnostic=True, slow=name != "cc_psnr", pixelwise=name != "cc_ssim",
+                     summary=summary)  # fmt: skip
     registry.add("cc_lpips_vgg_3dgs", "sw_metrics.colour_correction:CC_VGG_3DGS", digits=4, direction="lower",
                  label="LPIPS (VGG, 3DGS), colour-corrected", diagnostic=True, slow=True, group="lpips",
                  settings="sw_metrics.perceptual:LpipsSettings",

@@ -57,12 +57,13 @@ class DatasetTable:
     directions: dict[str, str] = field(default_factory=dict)
 
 
-def dataset_tables(runs: Sequence[Run], *, partial: bool = False) -> list[DatasetTable]:
+def dataset_tables(runs: Sequence[Run], *, partial: bool = False, diagnostic: bool = False) -> list[DatasetTable]:
     """A table for each data set and protocol that has more than one scene.
 
     partial     means over the scenes that are there, the missing ones named
+    diagnostic  with the metrics that tell conventions apart
     """
-    tables = [_table(part, partial) for part in comparable(runs)]
+    tables = [_table(part, partial, diagnostic) for part in comparable(runs)]
     return [table for table in tables if len(table.scenes) > 1]
 
 
@@ -99,7 +100,7 @@ def _one_protocol_a_scene(group: Sequence[Run]) -> list[list[Run]]:
     return list(apart.values())
 
 
-def _table(runs: Sequence[Run], partial: bool) -> DatasetTable:
+def _table(runs: Sequence[Run], partial: bool, diagnostic: bool) -> DatasetTable:
     dataset = dataset_facts(runs[0].facts.dataset)
     scene_of = {run: dataset.scene_of(run.facts.scene) for run in runs}
     scenes = dataset.scenes or tuple(sorted(set(scene_of.values()), key=natural))
@@ -107,7 +108,9 @@ def _table(runs: Sequence[Run], partial: bool) -> DatasetTable:
     for run, scene in scene_of.items():
         if scene in scenes:
             rows.setdefault((run.variant, run.facts.rate), {})[scene] = run
-    names = ordered_metrics(name for run in runs for name in run.facts.metrics if not run.facts.is_diagnostic(name))
+    names = ordered_metrics(
+        name for run in runs for name in run.facts.metrics if diagnostic or not run.facts.is_diagnostic(name)
+    )
     return DatasetTable(
         runs[0].facts.dataset,
         dataset.title,

@@ -67,6 +67,7 @@ class Chart:
     title       says what the chart shows, for those who do not see it
     levels      (y, what it is): horizontal lines across
     borders     (x, what begins there): vertical lines
+    stops       (x, its name) in place of numbers along the axis
     """
 
     title: str
@@ -76,6 +77,7 @@ class Chart:
     y_log: bool = False
     levels: Sequence[tuple[float, str]] = field(default=())
     borders: Sequence[tuple[float, str]] = field(default=())
+    stops: Sequence[tuple[float, str]] = field(default=())
 
     def draw(self) -> Markup:
         """Return the SVG element. Raises ValueError if no series has a point."""
@@ -85,7 +87,7 @@ class Chart:
         x = fitted_axis([p.x for p in points], LEFT, WIDTH - RIGHT, log=self.x_log, pad=0.05)
         heights = [p.y for p in points] + [level for level, _ in self.levels]
         y = fitted_axis(heights, HEIGHT - BOTTOM, TOP, log=self.y_log)
-        parts = [_grid(x, y), *(_border(x, at, text) for at, text in self.borders)]
+        parts = [_grid(x, y, self.stops), *(_border(x, at, text) for at, text in self.borders)]
         parts += [_level(y, at, text) for at, text in self.levels]
         parts += [_series(s, x, y) for s in self.series if s.points]
         axis = Markup('<text class="axis-label" x="{:.1f}" y="{}" text-anchor="middle">{}</text>').format(
@@ -96,9 +98,10 @@ class Chart:
         )
 
 
-def _grid(x: Axis, y: Axis) -> Markup:
+def _grid(x: Axis, y: Axis, named: Sequence[tuple[float, str]]) -> Markup:
     parts = []
     rows, stops = y.ticks(), x.ticks()
+    named = named or list(zip(stops, tick_labels(stops, log=x.log), strict=True))
     for tick, text in zip(rows, tick_labels(rows, log=y.log), strict=True):
         at = y.place(tick)
         parts.append(
@@ -107,7 +110,7 @@ def _grid(x: Axis, y: Axis) -> Markup:
             )
         )
     floor = HEIGHT - BOTTOM
-    for tick, text in zip(stops, tick_labels(stops, log=x.log), strict=True):
+    for tick, text in named:
         at = x.place(tick)
         parts.append(
             Markup(

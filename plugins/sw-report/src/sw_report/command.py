@@ -41,6 +41,8 @@ def _columns(_context: click.Context, _parameter: click.Parameter, incomplete: s
     click.option("--plots", metavar="FOLDER", type=OUTPUT_FOLDER,
                  help="Write FOLDER/rd-<scene>.svg and .pdf, rate-distortion curves for papers; needs matplotlib.  "
                  "[default: none]"),
+    click.option("--distance", "sheet", metavar="FILE", type=OUTPUT_FILE,
+                 help="Write one page about how far from the training views models hold.  [default: none]"),
     click.option("--csv", "form", flag_value="csv",
                  help="Print CSV: the survey's columns after what tells runs apart."),
     click.option("--latex", "form", flag_value="latex", help="Print LaTeX tables (booktabs)."),
@@ -48,9 +50,9 @@ def _columns(_context: click.Context, _parameter: click.Parameter, incomplete: s
     click.option("--json", "form", flag_value="json", help="Print one JSON object: runs, means, BD values, notes."),
     click.option("--jsonl", "form", flag_value="jsonl", help="Print one JSON object a run."),
     click.option("--columns", metavar="NAME[,NAME]", shell_complete=_columns,
-                 help="Columns of the tables: method, rate, scenes, seeds, psnr, ssim, lpips (or any metric), size, "
-                 "primitives, steps, train, encode, decode, fps; `all`, or `paper`: method, rate, psnr, ssim, lpips, "
-                 "size.  [default: paper with --latex, else all]"),
+                 help="Columns of the tables: method, rate, scenes, seeds, psnr, ssim, lpips (or any metric of the "
+                 "records, diagnostic ones too), size, primitives, steps, train, encode, decode, fps; `all`, or "
+                 "`paper`: method, rate, psnr, ssim, lpips, size.  [default: paper with --latex, else all]"),
     click.option("--anchor", metavar="METHOD", type=name_of("method"),
                  help="What BD-rates compare against.  [default: the most usual "
                  "of the methods whose curve overlaps with others]"),
@@ -66,6 +68,7 @@ def report(
     html: Path | None,
     survey: Path | None,
     plots: Path | None,
+    sheet: Path | None,
     form: str | None,
     columns: str | None,
     anchor: str | None,
@@ -81,7 +84,7 @@ def report(
     from sw_report import exports
     from sw_report.distortion import bd_tables, choose_anchor, why_no_values
     from sw_report.runs import collect
-    from sw_report.selection import PAPER, chosen_columns, selected
+    from sw_report.selection import PAPER, chosen_columns, names_columns, selected
 
     if columns is not None and form in ("csv", "json", "jsonl"):
         raise click.UsageError(f"--columns is for tables; --{form} has all values")
@@ -104,14 +107,21 @@ def report(
 
         for path in write_figures(collection.runs, plots):
             say(f"wrote {path}")
+    if sheet is not None:
+        from sw_report.page import write_sheet
+
+        write_sheet(collection, sheet)
+        say(f"wrote {sheet}")
     if form == "csv":
         click.echo(exports.to_csv(collection.runs), nl=False)
     elif form == "jsonl":
         click.echo(exports.to_json_lines(collection.runs), nl=False)
     elif form == "json":
         print_json(exports.to_dict(collection, anchor=against, partial=partial, pareto=pareto))
-    elif form is not None or (html is None and survey is None and plots is None):
-        tables = exports.tables_of(collection, anchor=against, partial=partial, pareto=pareto)
+    elif form is not None or not (html or survey or plots or sheet):
+        tables = exports.tables_of(
+            collection, anchor=against, partial=partial, pareto=pareto, diagnostic=names_columns(columns)
+        )
         wanted = chosen_columns(columns, [t for _, t in tables], default=PAPER if form == "latex" else None)
         tables = [(title, selected(table, wanted)) for title, table in tables]
         if form == "latex":

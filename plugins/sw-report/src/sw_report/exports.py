@@ -141,14 +141,20 @@ def to_json_lines(runs: Sequence[Run]) -> str:
     return "".join(json.dumps(run_dict(run), allow_nan=False) + "\n" for run in each)
 
 
-def tables_of(collection: Collection, *, anchor: str | None, partial: bool, pareto: bool) -> list[tuple[str, Table]]:
-    """(title, table): the runs of each scene and protocol, means over data sets, DTU's distances, BD values."""
+def tables_of(
+    collection: Collection, *, anchor: str | None, partial: bool, pareto: bool, diagnostic: bool = False
+) -> list[tuple[str, Table]]:
+    """(title, table): the runs of each scene and protocol, means over data sets, DTU's distances, BD values.
+
+    diagnostic  with the metrics that tell conventions apart
+    """
     runs = collection.runs
     found = []
     for place in dict.fromkeys(run.place for run in runs):
-        found.append((f"{place[0]}, protocol {place[1]}", runs_table([run for run in runs if run.place == place])))
+        table = runs_table([run for run in runs if run.place == place], diagnostic=diagnostic)
+        found.append((f"{place[0]}, protocol {place[1]}", table))
     found += [(prefixes_table(run).title, prefixes_table(run)) for run in with_prefixes(runs)]
-    for means in dataset_tables(runs, partial=partial):
+    for means in dataset_tables(runs, partial=partial, diagnostic=diagnostic):
         found.append((f"{means.title}, protocol {', '.join(means.protocols)}", means_table(means)))
     if (dtu := dtu_table(runs)) is not None:
         found.append((dtu.title, dtu))

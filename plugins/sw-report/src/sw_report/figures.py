@@ -14,6 +14,7 @@ from splatwizard_core.tooling import write_atomic
 from sw_report import numbers
 from sw_report.aggregate import DatasetTable, dataset_tables
 from sw_report.charts import STYLES
+from sw_report.distance import DISTANCE_LABEL, reached, with_distances
 from sw_report.distortion import drawn_metrics
 from sw_report.method_styles import styles_of
 from sw_report.plots import counts_anchors
@@ -26,32 +27,42 @@ if TYPE_CHECKING:
 
 FORMS = ("svg", "pdf")
 MARKERS = "os^DvPh*"  # in the order of `charts.MARKERS`
+DASHES = ("-", "--", "-.", ":")
 PANEL = (3.4, 2.6)  # inches: half of a page of two columns
 SALT = "splatwizard"  # equal curves make equal files
 
 
 @dataclass(frozen=True)
 class Line:
-    """Curve of one method: (megabytes, value, standard deviation over the seeds or None) by size."""
+    """Curve of one method: (megabytes or distance, value, standard deviation over the seeds or None), by the first.
+
+    dash    pattern of the line where it is not `dashed`, any number: for lines of one colour
+    """
 
     name: str
-    points: list[tuple[float, float, float | None]]
+    points: Sequence[tuple[float, float, float | None]]
     style: int
     dashed: bool = False
+    dash: int = 0
 
 
 @dataclass(frozen=True)
 class Panel:
-    """Curves of one metric."""
+    """Curves of one metric.
+
+    x_label     empty: the size of files, on a logarithmic axis
+    """
 
     label: str
     lines: list[Line]
+    x_label: str = ""
 
 
 def write_figures(runs: Sequence[Run], folder: Path) -> list[Path]:
     """Write rd-<scene>.svg and .pdf for every scene and protocol, and rd-<data set> for means over scenes.
 
-    Files with cuts have prefixes-<scene>.svg and .pdf besides, one line each.
+    Files with cuts have prefixes-<scene>.svg and .pdf besides, one line each; records that say how far test views lie
+    from the training views distance-<scene>.svg and .pdf.
 
     Nothing is written where no metric has a value. Raises UserInputError without matplotlib; returns the files.
     """
@@ -65,10 +76,13 @@ def write_figures(runs: Sequence[Run], folder: Path) -> list[Path]:
     pieces: dict[str, list[Panel]] = {}
     for place in dict.fromkeys(run.place for run in with_prefixes(runs)):
         pieces[_free(pieces, place[0])] = _of_prefixes([run for run in runs if run.place == place], styles)
+    far: dict[str, list[Panel]] = {}
+    for place in dict.fromkeys(run.place for run in with_distances(runs)):
+        far[_free(far, place[0])] = _of_distances([run for run in with_distances(runs) if run.place == place], styles)
     folder.mkdir(parents=True, exist_ok=True)
     return [
         write_panels(panels, folder / f"{kind}-{name}.{form}")
-        for kind, named in (("rd", drawings), ("prefixes", pieces))
+        for kind, named in (("rd", drawings), ("prefixes", pieces), ("distance", far))
         for name, panels in named.items() if panels
         for form in FORMS
     ]  # fmt: skip
@@ -138,6 +152,18 @@ def _of_prefixes(runs: Sequence[Run], styles: dict[str, int]) -> list[Panel]:
     ]  # fmt: skip
 
 
+def _of_distances(runs: Sequence[Run], styles: dict[str, int]) -> list[Panel]:
+    panels = []
+    for metric in drawn_metrics(runs):
+        lines = [
+            Line(run.label, [(x, y, None) for x, y in found.groups], styles[run.variant],
+                 dash=sum(run.variant == other.variant for other in runs[:i]))
+            for i, run in enumerate(runs) if (found := reached(run, metric)) is not None
+        ]  # fmt: skip
+        panels += [Panel(numbers.heading(metric), lines, DISTANCE_LABEL)] if lines else []
+    return panels
+
+
 def _of_means(table: DatasetTable, runs: Sequence[Run], styles: dict[str, int]) -> list[Panel]:
     panels = []
     of_table = [run for run in runs if run.facts.dataset == table.dataset]
@@ -167,17 +193,19 @@ def _draw(figure: Figure, panels: Sequence[Panel]) -> None:
             marker = MARKERS[(line.style + line.style // STYLES) % len(MARKERS)]
             style: dict[str, Any] = {
                 "color": colours[line.style % STYLES], "marker": marker,
-                "markersize": 4.5, "linewidth": 1.3, "linestyle": "--" if line.dashed else "-",
+                "markersize": 4.5, "linewidth": 1.3,
+                "linestyle": "--" if line.dashed else DASHES[line.dash % len(DASHES)],
             }  # fmt: skip
             (handles[line.name],) = axes.plot(x, y, **style)
             if any(deviation is not None for deviation in deviations):
                 axes.errorbar(x, y, [d or 0.0 for d in deviations], fmt="none", ecolor=style["color"], capsize=2)
-        axes.set_xscale("log")
-        # At 1, 2 and 5: what stands between powers of ten by default overlaps where there is one such power.
-        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axes.xaxis.set_major_formatter("{x:g}")
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.set_xlabel("file size, MB")
+        if not panel.x_label:
+            axes.set_xscale("log")
+            # At 1, 2 and 5: what stands between powers of ten by default overlaps where there is one such power.
+            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axes.xaxis.set_major_formatter("{x:g}")
+            axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.set_xlabel(panel.x_label or "file size, MB")
         axes.set_ylabel(_plain(panel.label))
         axes.grid(alpha=0.3, linewidth=0.5)
         axes.spines[["top", "right"]].set_visible(False)

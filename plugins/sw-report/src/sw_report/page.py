@@ -21,8 +21,11 @@ from sw_report import numbers, plots
 from sw_report import results_tables as tables
 from sw_report.aggregate import dataset_tables
 from sw_report.blocks import Part, Section, Table
+from sw_report.by_scene import scene_charts
 from sw_report.commands import commands_table
 from sw_report.declared import metric_style
+from sw_report.distance import HEADING as HOW_FAR
+from sw_report.distance import distance_parts, sheet_section
 from sw_report.distortion import bd_tables, choose_anchor, with_values
 from sw_report.dtu_table import dtu_table
 from sw_report.facts import RunFacts
@@ -87,27 +90,56 @@ def render_page(collection: Collection, options: PageOptions, folder: Path | Non
     """
     runs = collection.runs
     single = len(runs) == 1 and not runs[0].repeats
-    sections = _single_sections(runs[0], options) if single else _many_sections(runs, options)
+    return _rendered(
+        _title(runs), _lede(runs), collection.notes,
+        _single_sections(runs[0], options) if single else _many_sections(runs, options),
+        figures=_key_figures(runs[0]) if single else [],
+        scenes=[] if folder is None else scene_links(runs, folder),
+        side=LONGEST_SIDE if single else LONGEST_SIDE_OF_MANY,
+    )  # fmt: skip
+
+
+def write_sheet(collection: Collection, path: Path) -> None:
+    """Write the page about how far from the training views models hold, atomically.
+
+    Raises UserInputError if no record says how far its test views lie from the training views.
+    """
+    runs = collection.runs
+    section = sheet_section(runs, styles_of(runs))
+    write_atomic(path, _rendered(HOW_FAR, _lede(runs), collection.notes, [section]))
+
+
+def _rendered(
+    title: str,
+    lede: str,
+    notes: Sequence[str],
+    sections: Sequence[Section],
+    *,
+    figures: Sequence[dict[str, str]] = (),
+    scenes: Sequence[tuple[str, str]] = (),
+    side: int = LONGEST_SIDE,
+) -> str:
+    """Return the HTML text of a page."""
     template = page_template()
     loader = template.environment.loader
     assert loader is not None
     style, script = (loader.get_source(template.environment, name)[0] for name in ("style.css", "script.js"))
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
     return template.render(
-        title=_title(runs),
-        lede=_lede(runs),
+        title=title,
+        lede=lede,
         date=datetime.now(timezone.utc).strftime("%d %B %Y").lstrip("0"),
         version=importlib.metadata.version("splatwizard-core"),
-        figures=_key_figures(runs[0]) if single else [],
-        notes=collection.notes,
-        scenes=[] if folder is None else scene_links(runs, folder),
+        figures=figures,
+        notes=notes,
+        scenes=scenes,
         contents=[(section.id, section.short or section.title) for section in sections],
         sections=sections,
         style=Markup(style),
         script=Markup(script),
         script_hash=f"sha256-{digest}",
         gain=GAIN,
-        side=LONGEST_SIDE if single else LONGEST_SIDE_OF_MANY,
+        side=side,
     )
 
 
@@ -200,6 +232,8 @@ def _single_sections(run: Run, options: PageOptions) -> list[Section]:
     missing = tables.missing_metrics([run])
     parts += [Part(text="Not known: " + "; ".join(missing) + ".")] if missing else []
     sections.append(Section("views", VIEWS, parts, _of_training_views(facts), SHORT[VIEWS]))
+    if parts := distance_parts([run], styles_of([run])):
+        sections.append(Section("distance", HOW_FAR, [replace(part, heading="") for part in parts], short="Distance"))
     table = plots.single_sections_table(run)
     part = Part(table=table) if table is not None else Part(text="The record lists no sections of the file.")
     sections.append(Section("bytes", BYTES, [part], short=SHORT[BYTES]))
@@ -233,6 +267,8 @@ def _many_sections(runs: Sequence[Run], options: PageOptions) -> list[Section]:
             own = [r for r in runs if r.facts.dataset == table.dataset and r.facts.protocol.id in table.protocols]
             curves = plots.mean_charts(table, own, style_of)
             parts += [Part(charts=curves)] if curves is not None else []
+            by_scene = scene_charts(own, style_of)
+            parts += [Part("Scene by scene", charts=by_scene)] if by_scene is not None else []
         sections.append(Section("means", "Means over scenes", parts, short="Means"))
     if (dtu := dtu_table(runs)) is not None:
         sections.append(Section("dtu", "DTU", [Part(table=dtu)]))
@@ -314,7 +350,7 @@ def _rest(runs: Sequence[Run], style_of: dict[str, int]) -> list[Part]:
     if by_view is not None:
         parts.append(Part(VIEWS, charts=by_view))
         parts.append(Part(table=plots.views_table(runs), folded="All scores"))
-    return parts
+    return [*parts, *distance_parts(runs, style_of)]
 
 
 def _training(anchor: str, title: str, runs: Sequence[Run], breakdown: Table | None) -> Section:

@@ -37,9 +37,12 @@ def missing_metrics(runs: Iterable[Run]) -> list[str]:
     return [Note(f"{', '.join(names.values())}: {why}", *names) for why, names in reasons.items()]
 
 
-def runs_table(runs: Sequence[Run]) -> Table:
-    """One row a configuration and rate point: quality, size, times; of several seeds, mean ± standard deviation."""
-    names = metric_names(runs)
+def runs_table(runs: Sequence[Run], *, diagnostic: bool = False) -> Table:
+    """One row a configuration and rate point: quality, size, times; of several seeds, mean ± standard deviation.
+
+    diagnostic  with the metrics that tell conventions apart
+    """
+    names = metric_names(runs, diagnostic=diagnostic)
     several = any(len(run.seeds) > 1 for run in runs)
     heads = [
         Column("method", text=True, key="method"), Column("rate", text=True, key="rate"),

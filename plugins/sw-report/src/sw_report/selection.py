@@ -25,6 +25,11 @@ ALIASES = {
 """Other words for columns, as heads and records have them."""
 
 
+def names_columns(words: str | None) -> bool:
+    """Whether `--columns` names columns, which may then be diagnostic metrics, of which tables have none else."""
+    return words is not None and words.strip().lower() not in ("all", "paper")
+
+
 def chosen_columns(words: str | None, tables: Sequence[Table], *, default: Sequence[str] | None) -> list[str] | None:
     """Return the keys that `--columns` names: "all" is None, "paper" that set, None the default.
 

@@ -122,7 +122,7 @@ class WispModel(SplatModel):
 
     @property
     def rounding(self) -> Rounding:
-        """What stands in for rounding."""
+        """Stand-in for rounding."""
         rounds = self.phase == HARD or (self.training and self.phase not in (FLOAT, FINAL))
         return Rounding(self.phase, self.sharpness, self.sharpest) if rounds else AS_THEY_ARE
 

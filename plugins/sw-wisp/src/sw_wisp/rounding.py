@@ -23,7 +23,7 @@ def soft_round(y: Tensor, sharpness: float) -> Tensor:
 
 @dataclass(frozen=True)
 class Rounding:
-    """What is drawn, and whose bits are counted, in place of values.
+    """Values that are drawn, and whose bits are counted, in place of exact ones.
 
     phase           one of this module's
     sharpness       of soft rounding, 1..most; noise fades as it rises

@@ -25,7 +25,7 @@ from splatwizard_core.plugins import load_plugins
     shared.scene_option, shared.images_option, shared.config_option, shared.set_option,
     click.option(
         "--metrics", metavar="NAME[,NAME]", type=name_of("metric"),
-        help="Which metrics.  [default: every one over images that is installed]",
+        help="Which metrics.  [default: all over images that are installed, but slow diagnostics]",
     ),
     click.option(
         "--renders", metavar="DIR", type=OUTPUT_FOLDER,
@@ -96,15 +96,9 @@ def evaluate(
             encode_directory(session, resolved, file, measured)
             digest = decode_fresh(measured, str(session.device), threads=resolved.ppl.threads).digest
         found = measure(
-            session,
-            resolved,
-            open_trained if measured.is_dir() else opener(measured, session),
-            metrics=names,
-            geometry=geometry,
-            speed=not no_speed,
-            repeats=repeats,
-            renders=renders,
-        )
+            session, resolved, open_trained if measured.is_dir() else opener(measured, session),
+            metrics=names, geometry=geometry, speed=not no_speed, repeats=repeats, renders=renders,
+        )  # fmt: skip
         size = None if measured.is_dir() else measured.stat().st_size
         if prefixes and size is not None and session.plugins.importers.of_suffix(measured) is None:
             rows = measure_prefixes(session, resolved, measured, names or ["psnr", "ssim"])

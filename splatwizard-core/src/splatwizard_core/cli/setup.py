@@ -306,7 +306,7 @@ def warn_of_metrics(
 ) -> None:
     """Say before the work, once, what keeps metrics from being computed here.
 
-    names   None: all over images that are installed; with `geometry` those over models too
+    names   None: the usual ones over images; with `geometry` those over models too
     Raises UserInputError for settings that name something which is not there.
     """
     from splatwizard_core.evaluation.metrics import MetricSetup, chosen_metrics, unavailable

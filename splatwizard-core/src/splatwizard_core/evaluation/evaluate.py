@@ -162,6 +162,7 @@ def evaluate(
     quantize8: bool = True,
     metrics: Sequence[str] | None = None,
     metric_settings: MetricSettings | None = None,
+    masked: bool = False,
     save_to: Path | None = None,
     label: str = "evaluate",
 ) -> EvaluationResult:
@@ -170,8 +171,9 @@ def evaluate(
     device      where the model is
     options     as `render_options` makes them; their background is also that of RGBA pictures
     quantize8   round renders to 8 bit before comparing; a metric declared with `unrounded` never gets rounded ones
-    metrics     names from the registry; None: every one that is installed
+    metrics     names from the registry; None: the usual ones that are installed
     metric_settings     of metrics, group -> key -> value
+    masked      pictures were cut out by their masks: metrics declared with `pixelwise` get what is inside alone
     save_to     folder for the renders as PNG, named after the views; None: they are not kept
 
     A metric that cannot be imported, says CapabilityError (weights missing, say) or breaks is left unknown, with its
@@ -198,10 +200,13 @@ def evaluate(
             image = prepare_render(result.image, quantize8=quantize8)
             exact = prepare_render(result.image, quantize8=False)
             truth = view.image(options.background, device)
+            inside = view.mask.to(device) if masked and view.mask is not None else None
             for entry in (e for e in wanted if e.name not in missing):
-                drawn_image = exact if MetricInfo.of(entry).unrounded else image
+                pair = exact if MetricInfo.of(entry).unrounded else image, truth
+                if inside is not None and MetricInfo.of(entry).pixelwise:
+                    pair = pair[0][:, None, inside], truth[:, None, inside]
                 with noting_failure(entry, missing):
-                    values[entry.name].append(measured(entry, ready[entry.name], drawn_image, truth))
+                    values[entry.name].append(measured(entry, ready[entry.name], *pair))
             visible += int(result.visible.sum())
             drawn += len(result.inputs)
             if save_to is not None:

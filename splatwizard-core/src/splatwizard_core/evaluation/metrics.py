@@ -46,8 +46,9 @@ class MetricInfo:
     digits      after the decimal point, in tables
     direction   "higher" or "lower" is better
     diagnostic  computed to tell conventions apart, not for tables
-    slow        left out of evaluations during a training
+    slow        left out of evaluations during a training; a slow diagnostic is computed only where it is named
     unrounded   gets the render as it is, not rounded to 8 bit
+    pixelwise   gets pictures [3,1,n] of the pixels inside the mask, where the protocol cuts pictures out
     settings    "module:Model", the pydantic model of its settings; empty: it has none
     over        "image"; or "views" (where they lie) and "model": (Subject) -> MetricResult, None: does not apply
     """
@@ -60,6 +61,7 @@ class MetricInfo:
     diagnostic: bool = False
     slow: bool = False
     unrounded: bool = False
+    pixelwise: bool = False
     settings: str = ""
     over: str = "image"
 
@@ -143,14 +145,14 @@ AnyMetric = Metric | MetricFactory | Callable[[Any], Any]
 
 def quick_metrics(registry: TypedRegistry[AnyMetric]) -> list[str]:
     """Names of the metrics that are computed during training: the quick ones whose value the log is read for."""
-    infos = {entry.name: MetricInfo.of(entry) for entry in registry}
-    return [name for name, info in infos.items() if not (info.diagnostic or info.slow or info.over != "image")]
+    return [e.name for e in registry if not ((of := MetricInfo.of(e)).diagnostic or of.slow or of.over != "image")]
 
 
 def chosen_metrics(registry: TypedRegistry[Any], names: Iterable[str] | None, *, geometry: bool) -> list[Entry]:
-    """The metrics of an evaluation: those named (None: all but those over models), with `geometry` those besides."""
-    wanted = [e.name for e in registry if MetricInfo.of(e).over != "model"] if names is None else [*names]
-    wanted += [e.name for e in registry if geometry and MetricInfo.of(e).over == "model"]
+    """The metrics named (None: all but slow diagnostics and those over models), with `geometry` those over models."""
+    infos = {entry.name: MetricInfo.of(entry) for entry in registry}
+    usual = [n for n, of in infos.items() if of.over != "model" and not (of.slow and of.diagnostic)]
+    wanted = [*(usual if names is None else names), *(n for n in infos if geometry and infos[n].over == "model")]
     return [registry.entry(name) for name in dict.fromkeys(wanted)]
 
 

@@ -63,7 +63,7 @@ def measure(
 
     resolved    with the scene, the settings of metrics, and the choice of rasterizers
     open_model  () -> the model on the session's device; called first, before any picture is read
-    metrics     names; None: all over images that are installed, and PSNR over the training views where `eval_train`
+    metrics     names; None: the usual ones over images, and PSNR over the training views where `eval_train`
                 asks for it; with `geometry` all over models besides
     speed       also measure speed and memory
     repeats     how often speed is measured
@@ -116,7 +116,7 @@ def measure(
     result = quality.evaluate(
         model, views, rasterizer, plugins,
         device=device, options=options, quantize8=scene.protocol.quantize8, metrics=metrics,
-        metric_settings=resolved.metrics, save_to=renders,
+        metric_settings=resolved.metrics, masked=scene.protocol.masked, save_to=renders,
         label=f"evaluate on {scene.name}",
     )  # fmt: skip
     setup = MetricSetup(device, resolved.metrics)
@@ -177,14 +177,9 @@ def _environment(plugins: PluginManager, device: torch.device, seed: int) -> dic
 
 
 def _flags(
-    scene: Scene,
-    result: quality.EvaluationResult,
-    meter: MemoryMeter,
-    *,
-    device_bound: bool,
-    bad_rows: int,
+    scene: Scene, result: quality.EvaluationResult, meter: MemoryMeter, *, device_bound: bool, bad_rows: int,
     contended: bool,
-) -> list[str]:
+) -> list[str]:  # fmt: skip
     """Name the circumstances that a reader of the numbers must know."""
     told = {
         "fit": scene.protocol.split == "all",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -9,12 +10,13 @@ import click
 
 from splatwizard_core.api import UserInputError
 from splatwizard_core.tooling import Choices, load_plugins, open_session, print_facts, print_table
-from sw_bench.gsc.protocol import ANCHOR, Plan, bench_gsc
+from sw_bench.gsc.frames import frame_files, sequence_of
+from sw_bench.gsc.protocol import ALPHA_MAX, ANCHOR, Plan, bench_gsc
 from sw_bench.gsc.views import Asked, size_of
 
 OPTIONS = {
     "anchor": None, "path": ("auto", "orbit16", "inside16"), "up": None, "quaternion": ("w2c", "c2w"),
-    "range": ("auto", "fixed"),
+    "range": ("auto", "fixed"), "alpha_max": ("0.99", "0.999"),
 }  # fmt: skip
 """Keys of -o, with their values where these are few."""
 OF_VIEWS = ("path", "up", "quaternion")
@@ -23,11 +25,17 @@ USELESS = ("scene", "seed", "preset", "images", "init", "config_file", "geometry
 
 
 def bench_models(
-    paths: tuple[str, ...], given: dict[str, Any], *, cameras: Path | None, views: str | None, size: str | None
+    paths: tuple[str, ...],
+    given: dict[str, Any],
+    *,
+    cameras: Path | None,
+    views: str | None,
+    size: str | None,
+    frames: str | None,
 ) -> None:
     """Run the protocol on files, and print it. Raises UserInputError, click.UsageError."""
-    if not paths:
-        raise click.UsageError("--protocol mpeg-gsc: give one or more trained models FILE...")
+    if bool(paths) == (frames is not None):
+        raise click.UsageError("--protocol mpeg-gsc: give one or more trained models FILE..., or --frames")
     if useless := [name for name in USELESS if given.get(name) not in (None, (), "", False)]:
         raise click.UsageError(f"--{useless[0].removesuffix('_file').replace('_', '-')} is of no use with --protocol")
     for path in paths:
@@ -35,10 +43,15 @@ def bench_models(
             raise UserInputError(f"{path}: there is no such file")
     options = options_of(given["given"])
     chosen = Choices(sets=tuple(given["sets"]), device=given["device"])
-    resolved = Choices(device=given["device"]).resolve_without_method()
-    session = open_session(resolved, load_plugins())
+    plugins, alpha_max = load_plugins(), float(options.get("alpha_max", ALPHA_MAX))
+    fitting = [e.name for e in plugins.rasterizers if e.declared.get("alpha_max", ALPHA_MAX) == alpha_max]
+    prefer = () if alpha_max == ALPHA_MAX else (f"raster.prefer={json.dumps(fitting)}",)
+    resolved = Choices(device=given["device"], sets=prefer).resolve_without_method()
+    session = open_session(resolved, plugins)
     plan = Plan(
-        files=[Path(path) for path in paths],
+        files=[Path(path) for path in paths] if frames is None else frame_files(frames),
+        sequence=None if frames is None else sequence_of(frames),
+        alpha_max=alpha_max,
         out=Path(given["out"] or "out") / "mpeg-gsc",
         codecs=[name.strip() for text in given["methods"] for name in text.split(",") if name.strip()],
         anchor=options.get("anchor", ANCHOR),

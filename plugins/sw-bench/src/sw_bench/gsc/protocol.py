@@ -41,12 +41,14 @@ from splatwizard_core.tooling import (
 )
 from sw_bench.gsc import TITLE
 from sw_bench.gsc.coding import CodecFailedError, code
+from sw_bench.gsc.frames import joined
 from sw_bench.gsc.scores import FOREGROUND, score
 from sw_bench.gsc.tables import BD_COLUMNS, COLUMNS, Row, bd_rows, csv_text, parts_of, summary
 from sw_bench.gsc.views import Asked, Views, views_of
 
 ANCHOR = "gsc-quant"
 EMPTY = 1.0  # % of a picture: a view of the source with less is left out
+ALPHA_MAX = 0.99  # of rasterizers that declare nothing
 ONE_RATE = "r0"  # of a codec without a dial
 
 
@@ -55,6 +57,8 @@ class Plan:
     """Models, codecs and views that are asked for.
 
     files       models, of any format that is read here
+    sequence    name of the sequence whose frames the files are; None: each is a scene
+    alpha_max   limit of a splat's opacity in a pixel, which the rasterizer must have
     codecs      methods that encode a .ply; empty: all that declare `training_free`
     anchor      codec that BD-rates are against
     sets        keys of the codecs, as of --set
@@ -68,6 +72,8 @@ class Plan:
     asked: Asked = field(default_factory=Asked)
     sets: Sequence[str] = ()
     range: str = "auto"
+    sequence: str | None = None
+    alpha_max: float = ALPHA_MAX
 
 
 @dataclass(frozen=True)
@@ -91,6 +97,7 @@ class Source:
     empty: list[str]
     clipped: list[str]
     ids: dict[str, str]
+    all_views: Views
 
 
 def bench_gsc(plan: Plan, session: Session, resolved: ResolvedConfig) -> dict[str, Any]:
@@ -102,12 +109,20 @@ def bench_gsc(plan: Plan, session: Session, resolved: ResolvedConfig) -> dict[st
     names = sequence_names(plan.files)
     rows: list[Row] = []
     sources: list[dict[str, Any]] = []
+    views: Views | None = None
     for name, file in zip(names, plan.files, strict=True):
-        source = open_source(name, file, plan, session, resolved)
+        source = open_source(name, file, plan, session, resolved, views)
         sources.append(_facts(source))
+        if plan.sequence is not None:  # all frames are seen from where the first one is
+            views = views or source.all_views
         for entry in entries:
             for rate in entry.declared.get("rates") or [None]:
                 rows.append(_row(source, entry, rate, plan, session, resolved))
+    if plan.sequence is not None:
+        cells = dict.fromkeys((row["codec"], row["rate"]) for row in rows)
+        rows = [joined(plan.sequence, [row for row in rows if (row["codec"], row["rate"]) == cell]) for cell in cells]
+        first = {**sources[0], "sequence": plan.sequence, "protocol": rows[0]["protocol"]}
+        sources = [first | {"frames": sources, "splats": sum(each["splats"] for each in sources)}]
     rows.sort(key=lambda row: (row["sequence"], row["codec"], row["rate"]))
     bd = bd_rows(rows, plan.anchor)
     found = {"protocol": TITLE, "anchor": plan.anchor, "sources": sources, "rows": rows, "bd": bd}
@@ -142,8 +157,13 @@ def sequence_names(files: Sequence[Path]) -> list[str]:
     return names
 
 
-def open_source(name: str, file: Path, plan: Plan, session: Session, resolved: ResolvedConfig) -> Source:
-    """Read a model, find its views, draw it. Raises UserInputError for one without Gaussians, or with broken values."""
+def open_source(
+    name: str, file: Path, plan: Plan, session: Session, resolved: ResolvedConfig, views: Views | None = None
+) -> Source:
+    """Read a model, find its views, draw it. Raises UserInputError for one without Gaussians, or with broken values.
+
+    views   where it is seen from; None: as the plan asks
+    """
     from sw_interchange.gsc_quant import clipped_attributes
 
     model = session.plugins.read_gaussians(file)
@@ -159,9 +179,16 @@ def open_source(name: str, file: Path, plan: Plan, session: Session, resolved: R
     model.prepare()
     raster = dict(model.origin.get("raster", {})) if isinstance(model.origin, dict) else {}
     options = dataclasses.replace(render_options(raster, torch.zeros(3, device=session.device)), alpha=True)
-    views = views_of(file, model, plan.asked, session.plugins)
+    views = views or views_of(file, model, plan.asked, session.plugins)
+    if plan.sequence is not None:  # photographs are of one moment
+        views = dataclasses.replace(views, photographs=None)
     sha = file_sha256(file)
     drawn, drawn_by = _draw(model, views, options, session, resolved, f"draw {name}")
+    if not drawn_by.endswith(f"-{limit_word(plan.alpha_max)}"):
+        raise UserInputError(
+            f"no rasterizer on {session.device.type} draws it with an opacity limit of {plan.alpha_max:g}; {drawn_by} "
+            "would: gsplat has 0.999, on a GPU"
+        )
     shown = [i for i, opacity in enumerate(drawn.opacities) if occupancy(opacity) >= EMPTY]
     empty = [each for i, each in enumerate(views.names) if i not in shown]
     if not shown:
@@ -173,7 +200,7 @@ def open_source(name: str, file: Path, plan: Plan, session: Session, resolved: R
     ids = {
         kind: f"gsc-{sha[:8]}/{views.label}/{views.size}/{kind}/black/{drawn_by}/q8{tail}" for kind in ("src", "photos")
     }
-    source = Source(name, file, model, options, views.part(shown), drawn, empty, clipped, ids)
+    source = Source(name, file, model, options, views.part(shown), drawn, empty, clipped, ids, views)
     _keep(source, plan.out / name / "reference")
     return source
 
@@ -199,8 +226,15 @@ def _draw(
             opacities.append(_levels(result.alpha)[0])
             bar.advance()
     names = sorted(set(rasterizer.drawn_by.values()))
-    versions = [f"{each}-{session.plugins.rasterizers.entry(each).version}" for each in names]
-    return Drawn(pictures, opacities), "+".join(versions) + "-a99"
+    entries = [session.plugins.rasterizers.entry(each) for each in names]
+    limits = {limit_word(each.declared.get("alpha_max", ALPHA_MAX)) for each in entries}
+    versions = "+".join(f"{each.name}-{each.version}" for each in entries)
+    return Drawn(pictures, opacities), f"{versions}-{'+'.join(sorted(limits))}"
+
+
+def limit_word(alpha_max: float) -> str:
+    """Word of the protocol's id for a limit of opacity: a99, a999."""
+    return f"a{f'{alpha_max:g}'.partition('.')[2]}"
 
 
 def _levels(image: Tensor) -> Tensor:

@@ -71,8 +71,8 @@ def bd_rows(rows: Sequence[Row], anchor: str) -> list[Row]:
     sequences = sorted({row["sequence"] for row in rows})
     codecs = sorted({row["codec"] for row in rows} - {anchor})
     for codec in codecs:
-        of_codec = [_bd(rows, sequence, codec, anchor) for sequence in sequences]
-        of_codec = [row for row in of_codec if row is not None]
+        all_scenes = (_bd(rows, sequence, codec, anchor) for sequence in sequences)
+        of_codec = [row for row in all_scenes if row is not None]
         if not of_codec:
             continue
         mean: Row = {"sequence": MEAN, "codec": codec, "anchor": anchor}
@@ -109,7 +109,7 @@ def _bd(rows: Sequence[Row], sequence: str, codec: str, anchor: str) -> Row | No
             notes.append(f"{name}: fewer than {FEWEST_POINTS} points")
         else:
             try:
-                (ours, theirs) = (tuple(zip(*points[who], strict=True)) for who in (anchor, codec))
+                ours, theirs = (([x for x, _ in points[who]], [y for _, y in points[who]]) for who in (anchor, codec))
                 result = bd_rate(ours, theirs, names=(anchor, codec), metric=name)
                 value, overlap = result.value, result.overlap
                 notes += [f"{name}: {flag}" for flag in result.flags]

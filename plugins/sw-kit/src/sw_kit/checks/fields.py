@@ -61,7 +61,7 @@ ANY: Rule = (lambda value: True, "")
 METRIC: dict[str, Rule] = {
     **{field.name: ANY for field in dataclasses.fields(MetricInfo)},
     "direction": DIRECTION, "digits": COUNT, "position": NUMBER, "label": TEXT, "unit": TEXT, "settings": WHERE,
-    "diagnostic": FLAG, "slow": FLAG, "unrounded": FLAG, "over": OVER,
+    "diagnostic": FLAG, "slow": FLAG, "unrounded": FLAG, "pixelwise": FLAG, "over": OVER,
 }  # fmt: skip
 FIELDS: Mapping[str, Mapping[str, Rule]] = {
     "method": {

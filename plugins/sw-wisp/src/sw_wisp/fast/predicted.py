@@ -163,7 +163,7 @@ def _to_ties(products: Tensor) -> list[Tensor]:
 
 @functools.cache
 def _tie_places(device: torch.device) -> tuple[Tensor, Sequence[tuple[int, int]], Sequence[int]]:
-    """Where a gradient of each weight of a tie stands among those products, shapes of ties, and where they begin."""
+    """Places of each tied weight's gradient among those products, shapes of ties, and where they begin."""
     table = torch.arange(ALL_OUTPUTS * TOLD[-1].stop).view(ALL_OUTPUTS, -1)
     parts, shapes, starts, length = [], [], [], 0
     for part, before in tied_parts():

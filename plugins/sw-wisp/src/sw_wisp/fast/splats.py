@@ -1,4 +1,4 @@
-"""What is drawn of the numbers of splats, as one node of the graph of derivatives: two kernels and matrix products."""
+"""Gaussians drawn of the numbers of splats, as one node of the graph of derivatives: two kernels, matrix products."""
 
 from __future__ import annotations
 

@@ -78,7 +78,7 @@ class FastReader(Stream):
 
 
 def reader_of(data: bytes | memoryview) -> Reader | FastReader:
-    """What decodes the bytes of a packet fastest here. Raises BitstreamError."""
+    """Decoder that reads the bytes of a packet fastest here. Raises BitstreamError."""
     return FastReader(data) if EXACT.try_load() else Reader(data)
 
 
