@@ -156,8 +156,7 @@ SHELVES = {"sw_rasterizers", "sw_codecs", "sw_gaussians", "sw_anchors", "sw_refe
 FOR_ONE = {
     "sw_gaussians.baking": "makes explicit Gaussians of a model for sw-view, and knows the parts of GaussianModel",
     "sw_gaussians.bake_refining": "trains on pictures that sw-view gives it, with the stage of sw-gaussians",
-    "sw_gaussians.made_up_cameras": "cameras for Gaussians that came without any, beside those of files and paths",
-    "sw_gaussians.ring_cameras": "two closed rules of the same, by which the MPEG protocol draws",
+    "sw_gaussians.ring_cameras": "two more recipes beside `made_up_cameras`, by which the MPEG protocol draws",
 }
 """Module of a library that one family alone reaches -> why it is there; at most ten."""
 

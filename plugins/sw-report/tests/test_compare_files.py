@@ -174,10 +174,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_two_files_without_a_scene_are_seen_from_all_sides(capsys, monkeypatch, folder: Path):
-    monkeypatch.setattr("sw_report.compare.SIZE", (48, 32))
+def test_two_files_without_a_scene_are_seen_by_cameras_that_are_made_up(capsys, monkeypatch, folder: Path):
+    monkeypatch.setattr("sw_report.compare.MADE_UP", 3)
     same = run(capsys, folder / "a.ply", folder / "a.ply")
-    assert same["psnr"] == {"views": 12, "mean": 100, "least": 100}
+    assert same["psnr"] == {"views": 3, "mean": 100, "least": 100}
+    assert same["cameras"] == "made up, plausible"
     facts = run(capsys, folder / "a.ply", folder / "b.ply")
     assert facts["b"] == {"file": str(folder / "b.ply"), "kind": "ply", "bytes": (folder / "b.ply").stat().st_size,
                           "counts": {"num_gaussians": 60}, "sh_degree": 1}  # fmt: skip
@@ -268,7 +269,7 @@ def test_runs_of_different_scenes_are_refused_unless_a_scene_or_cameras_are_name
 
 def test_the_images_of_a_folder_count_among_its_bytes(tmp_path: Path, capsys, monkeypatch, folder: Path):
     pytest.importorskip("sw_interchange")
-    monkeypatch.setattr("sw_report.compare.SIZE", (24, 16))
+    monkeypatch.setattr("sw_report.compare.MADE_UP", 1)
     meta = tmp_path / "meta.json"
     assert main(["export", str(folder / "a.ply"), str(meta), "--json"]) == 0
     size = sum(file.stat().st_size for file in tmp_path.iterdir())

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from splatwizard_core.api import Camera, View
     from sw_report.compared_models import OpenedFile
 
-GENERATED, SIZE = 12, (512, 512)
-"""Number and size of the pictures where neither a scene nor cameras are given."""
+MADE_UP = 12
+"""Pictures where neither a scene nor cameras are given."""
 
 
 @click.command(short_help="two files; a run beside published figures")
@@ -37,7 +37,7 @@ GENERATED, SIZE = 12, (512, 512)
     click.option(
         "--cameras", type=EXISTING, metavar="FILE",
         help="JSON of the cameras to draw from (README of sw-view).  [default: the scene's test views; without a "
-        "scene 12 cameras around the Gaussians]",
+        "scene 12 that are made up]",
     ),
     click.option(
         "--path", "is_path", is_flag=True,
@@ -113,9 +113,9 @@ def _compared(a: Path, b: Path, camera_file: Path | None, chosen: Choices, *, is
     scene = session.scene(resolved) if chosen.scene is not None or configs else None
     left, right = (open_file(path, session, resolved, scene) for path in (a, b))
     test = [] if scene is None or camera_file is not None else scene.test
-    places = [view.camera for view in test] or _places(camera_file, left, right)
-    seen_from = f"test views of {scene.name}" if scene is not None and test else "around the Gaussians"
-    seen_from = seen_from if camera_file is None else str(camera_file)
+    places, seen_from = [view.camera for view in test], f"test views of {scene.name}" if scene is not None else ""
+    if not test:
+        places, seen_from = _places(camera_file, left, right)
     errors = None
     explicit = isinstance(left.model, GaussianModel) and isinstance(right.model, GaussianModel)
     if isinstance(left.model, GaussianModel) and isinstance(right.model, GaussianModel):
@@ -131,18 +131,19 @@ def _compared(a: Path, b: Path, camera_file: Path | None, chosen: Choices, *, is
     }
 
 
-def _places(camera_file: Path | None, left: OpenedFile, right: OpenedFile) -> list[Camera]:
-    """Cameras of a file, or around the Gaussians of whichever model is explicit."""
+def _places(camera_file: Path | None, left: OpenedFile, right: OpenedFile) -> tuple[list[Camera], str]:
+    """Cameras of a file, or made up for whichever model is explicit, A first; and what they are called."""
     from sw_gaussians.camera_files import read_cameras
-    from sw_gaussians.camera_paths import around
+    from sw_gaussians.made_up_cameras import plausible_cameras
 
     from splatwizard_core.api import GaussianModel, UserInputError
 
     if camera_file is not None:
-        return read_cameras(camera_file).cameras
-    for model in (left.model, right.model):
-        if isinstance(model, GaussianModel):
-            return around(model.means, model.opacities, GENERATED, SIZE)
+        return read_cameras(camera_file).cameras, str(camera_file)
+    for each in (left, right):
+        if isinstance(each.model, GaussianModel):  # by those held out: B may have been made for the others
+            made = plausible_cameras(each.model, each.rasterizer, fit=1, held_out=MADE_UP)
+            return made.held_out, f"made up, {made.recipe}"
     raise UserInputError("the Gaussians of both depend on the camera: give --scene SCENE or --cameras FILE")
 
 

@@ -15,6 +15,7 @@ from splatwizard_core.api import (
     PluginManager,
     Protocol,
     Scene,
+    SceneError,
     SplatModel,
     UserInputError,
 )
@@ -22,7 +23,7 @@ from splatwizard_core.tooling import Choices, NegotiatedRasterizer, bytes_with_n
 from sw_view.drawing import Drawing
 from sw_view.packing import solid_means
 from sw_view.page_file import MADE_UP, About
-from sw_view.shown_cameras import Surroundings, surroundings_about, surroundings_of
+from sw_view.shown_cameras import Surroundings, made_up_surroundings, surroundings_about, surroundings_of
 
 ENCODED, CONFIG = "scene.swz", "config.toml"
 MOST = 200
@@ -140,5 +141,8 @@ def _about(drawing: Drawing) -> Surroundings:
     """Return cameras around a model without a scene: around its Gaussians, else around its anchors."""
     model = drawing.model
     if isinstance(model, GaussianModel):
-        return surroundings_about(solid_means(model))
+        try:
+            return made_up_surroundings(model, drawing.rasterizer)
+        except SceneError:  # no such camera shows anything: there may be something that can be drawn all the same
+            return surroundings_about(solid_means(model))
     return surroundings_about(getattr(model, model.ROWS[0]).detach().float().cpu().numpy()[:, :3])

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from sw_gaussians.path_spline import quat_of, rotation_of
 
 from splatwizard_core.api import Camera
+from sw_view.path_spline import quat_of, rotation_of
 
 Pixels = NDArray[np.uint8]  # [H,W,3]
 

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from sw_gaussians.camera_paths import nearest_to_axes
+from sw_gaussians.made_up_cameras import NEAR, plausible_cameras
 
-from splatwizard_core.api import Camera, Scene, SceneError, View
+from splatwizard_core.api import Camera, GaussianModel, Rasterizer, Scene, SceneError, View
+from sw_view.camera_paths import nearest_to_axes
 
 MOST = 64
 """Cameras of a scene that are offered, spread evenly."""
@@ -59,11 +60,16 @@ def surroundings_of(scene: Scene) -> Surroundings:
     up = np.mean([-camera.R[1].double().cpu().numpy() for camera in cameras], axis=0)
     if np.linalg.norm(up) < 1e-3:  # cameras all around: no direction is up more than another
         up = -cameras[0].R[1].double().cpu().numpy()
+    pivot, size = _middle(cameras, scene.extent)
+    return Surroundings(cameras_of(scene), up / np.linalg.norm(up), pivot, size)
+
+
+def _middle(cameras: Sequence[Camera], extent: float) -> tuple[NDArray[np.float64], float]:
+    """The point [3] that cameras look at, and their mean distance from it."""
     centers = np.stack([camera.center.double().cpu().numpy() for camera in cameras])
     forwards = np.stack([camera.R[2].double().cpu().numpy() for camera in cameras])
-    pivot = looked_at(centers, forwards, scene.extent)
-    size = float(np.linalg.norm(centers - pivot, axis=1).mean())
-    return Surroundings(cameras_of(scene), up / np.linalg.norm(up), pivot, size)
+    pivot = looked_at(centers, forwards, extent)
+    return pivot, float(np.linalg.norm(centers - pivot, axis=1).mean())
 
 
 def looked_at(centers: NDArray[np.float64], forwards: NDArray[np.float64], extent: float) -> NDArray[np.float64]:
@@ -79,6 +85,18 @@ def looked_at(centers: NDArray[np.float64], forwards: NDArray[np.float64], exten
     ahead = ahead if np.linalg.norm(ahead) > 0.1 else forwards[0]
     middle: NDArray[np.float64] = centers.mean(axis=0) + extent * ahead / np.linalg.norm(ahead)
     return middle
+
+
+def made_up_surroundings(model: GaussianModel, rasterizer: Rasterizer) -> Surroundings:
+    """Return eight cameras around Gaussians or, in a room, among them; up is -y.
+
+    Raises SceneError where none shows anything.
+    """
+    made = plausible_cameras(model, rasterizer, fit=6, held_out=2, widest=SIZE[0])
+    cameras = [*made.fit, *made.held_out]
+    pivot, size = _middle(cameras, cameras[0].near / NEAR)
+    named = [NamedCamera(f"made up, {i}", camera) for i, camera in enumerate(cameras, 1)]
+    return Surroundings(named, np.array([0.0, -1.0, 0.0]), pivot, size)
 
 
 def surroundings_about(means: NDArray[np.float32]) -> Surroundings:

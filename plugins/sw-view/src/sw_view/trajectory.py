@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from sw_gaussians.camera_files import read_cameras
-from sw_gaussians.camera_paths import along, orbit, seen_depths, spiral
 
 from splatwizard_core.api import Camera, SceneError, UserInputError, View
+from sw_view.camera_paths import along, orbit, seen_depths, spiral
 from sw_view.modes import PATHS
 
 if TYPE_CHECKING:

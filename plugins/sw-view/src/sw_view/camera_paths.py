@@ -1,4 +1,4 @@
-"""Camera paths for videos and comparisons: an orbit, a spiral, a spline through given cameras, cameras around a model.
+"""Camera paths for videos and comparisons: an orbit, a spiral, a spline through given cameras.
 
 All cameras of a path share one picture size and one field of view, the median vertical one of the cameras given.
 """
@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from splatwizard_core.api import Camera, SceneError
-from sw_gaussians.path_spline import spline_poses
+from sw_view.path_spline import spline_poses
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Rasterizer, SplatModel
@@ -96,33 +96,6 @@ def along(cameras: Sequence[Camera], frames: int, size: tuple[int, int]) -> list
     return [_camera(cameras, eye, rotation, size) for eye, rotation in zip(eyes, turned, strict=True)]
 
 
-def around(means: torch.Tensor, opacities: torch.Tensor, count: int, size: tuple[int, int]) -> list[Camera]:
-    """Cameras on a sphere about the Gaussians [N,3] of a file without cameras, evenly spread, all looking inwards.
-
-    The sphere is that which holds 90 % of the opacity [N], and the cameras stand so that it fills their pictures.
-    """
-    points, weights = means.detach().cpu().double().numpy(), opacities.detach().cpu().double().numpy()
-    kept = np.isfinite(points).all(axis=1) & np.isfinite(weights) & (weights > 0)
-    if not kept.any():
-        raise SceneError("no Gaussian is opaque and finite, so there is nothing to look at")
-    points, weights = points[kept], weights[kept]
-    middle = np.array([_weighted(points[:, i], weights, 0.5) for i in range(3)])
-    radius = max(_weighted(np.linalg.norm(points - middle, axis=1), weights, 0.9), 1e-6)
-    fov = math.radians(50)
-    distance = radius / math.sin(fov / 2)
-    found = []
-    for i in range(count):
-        z = 1 - (2 * i + 1) / count  # Fibonacci's lattice: equal areas, golden angles
-        angle = math.pi * (3 - math.sqrt(5)) * i
-        flat = math.sqrt(max(0.0, 1 - z * z))
-        eye = middle + distance * np.array([flat * math.cos(angle), flat * math.sin(angle), z])
-        up = np.array([0.0, 0.0, 1.0]) if abs(z) < 0.9 else np.array([0.0, 1.0, 0.0])
-        fov_x = 2 * math.atan(math.tan(fov / 2) * size[0] / min(size))
-        given = (torch.from_numpy(each).float() for each in (eye, middle, up))
-        found.append(Camera.look_at(*given, width=size[0], height=size[1], fov_x=fov_x, near=1e-3 * distance))
-    return found
-
-
 def focus_of(cameras: Sequence[Camera], depth: float) -> Array:
     """Return the point [3] nearest to all viewing axes; if parallel, `depth` in front of the mean camera."""
     centers, rotations = _poses(cameras)
@@ -201,13 +174,6 @@ def _camera(cameras: Sequence[Camera], eye: Array, rotation: Array, size: tuple[
     tau = torch.from_numpy(-rotation @ eye).float()
     near = min(each.near for each in cameras)
     return Camera(width, height, focal, focal, width / 2, height / 2, R, tau, near=near)
-
-
-def _weighted(values: Array, weights: Array, share: float) -> float:
-    """Return the weighted quantile."""
-    order = np.argsort(values)
-    total = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(total, share * total[-1])])
 
 
 def _unit(vector: Array) -> Array:
