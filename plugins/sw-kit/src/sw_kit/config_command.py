@@ -66,9 +66,14 @@ def blocks(method: str, preset: str | None, rate: str | None) -> Iterator[tuple[
     found = resolve(plugins.methods.load(method), preset or "paper", rate, plugins=plugins)
     yield f"{method}, preset {found.preset}, rate {found.rate}", list(rows_of(found.config, plugins))
     yield "run", list(rows_of(found.ppl, plugins))
-    meanings = dict(re.findall(r"^    (\w+) +(.+)$", SceneOptions.__doc__ or "", re.M))
+    told = re.findall(r"^    (\w+(?:, \w+)*) +(.+)$", SceneOptions.__doc__ or "", re.M)
+    meanings = {name: meaning for names, meaning in told for name in names.split(", ")}
     yield "scene", [each | {"meaning": meanings.get(each["key"], "")} for each in rows_of(SceneParams(), plugins)]
-    groups = {str(entry.declared.get("group", entry.name)): entry for entry in plugins.metrics if entry.declared.get("settings")}
+    groups = {
+        str(entry.declared.get("group", entry.name)): entry
+        for entry in plugins.metrics
+        if entry.declared.get("settings")
+    }
     models = {name: _imported(str(entry.declared["settings"])) for name, entry in groups.items()}
     yield "metrics", [row for name, model in models.items() for row in rows_of(model(), plugins, f"metrics.{name}.")]
 

@@ -48,7 +48,7 @@ class Arriving:
 
     @property
     def told(self) -> str:
-        """How much is there, in one line; nothing once all is."""
+        """Share that is there, in one line; nothing once all is."""
         if not self.ended:
             return f"{self.packets} of {self.declared} packets have arrived"
         return f"{self.packets} of {self.declared} packets arrived: {self.error}" if self.error else ""
@@ -88,7 +88,7 @@ class Arriving:
             self._take(ContainerReader(bytes(self._data), self.file.name, Prefix(partial=True)))
 
     def _first_end(self) -> list[int]:
-        """Where the first cut is, of the opening that has arrived (docs/bitstream.md); nothing if it does not tell."""
+        """Place of the first cut, by the opening that has arrived (docs/bitstream.md); nothing if it does not tell."""
         if len(self._data) < OPENING.size:
             return []
         _, version, length = OPENING.unpack_from(self._data)

@@ -58,7 +58,7 @@ class Layers:
 
 
 class Known(NamedTuple):
-    """What packets tell of each subset [J]: whether its splats are there, refinements that are missing, latents."""
+    """Facts of each subset [J] that packets tell: whether its splats are there, missing refinements, latents."""
 
     there: Tensor
     missing: Tensor

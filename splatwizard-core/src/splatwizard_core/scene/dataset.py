@@ -17,7 +17,7 @@ class SceneOptions:
     protocol        "survey" or "inria": which named choice of pictures the family's defaults follow (None: "survey")
     images          picture folder of a COLMAP scene, such as "images_2"
     resolution      -1 (1600 px rule), 1, 2, 4, 8, or a width in pixels
-    split           "every8" (test_every=8 in short) and the like, "file", "all", or the path of a file of view names
+    split, test_every   "every8" (test_every=8 in short) and the like, "file", "all", or a file of view names
     points          which start points are used: "all", or those that training views saw ("train-tracks")
     background, principal_point    "black" or "white"; "center" or "file"
     mask_background pictures are cut out by alpha or mask, those of Blender scenes always; False: alpha is a mask only
