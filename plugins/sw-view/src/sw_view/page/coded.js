@@ -48,9 +48,9 @@ function forGpu(arrays, facts) {
   return { means, words, harmonics: new Uint32Array(harmonics.buffer), texels };
 }
 
-self.onmessage = async ({ data: { wasm, file, facts } }) => {
+self.onmessage = async ({ data: { wasm, file, tables, facts } }) => {
   try {
-    const found = forGpu(plain(parameters(await WebAssembly.compile(wasm), file).arrays), facts);
+    const found = forGpu(plain(parameters(await WebAssembly.compile(wasm), file, { tables }).arrays), facts);
     self.postMessage({ found }, [found.means.buffer, found.words.buffer, found.harmonics.buffer]);
   } catch (error) {
     self.postMessage({ failure: error.message });

@@ -11,14 +11,14 @@ async function unpacked(text) {
 }
 
 // What the page holds: the encoded file and its decoder (coded.js), or Gaussians as they are drawn.
-async function gaussiansOf(text, decoder, wasm, facts) {
+async function gaussiansOf(text, decoder, wasm, tables, facts) {
   if (!decoder) return gaussiansFrom(await unpacked(text), facts);
   const worker = new Worker(URL.createObjectURL(new Blob([decoder.textContent], { type: 'text/javascript' })));
   const module = await unpacked(wasm.textContent);
   return new Promise((resolve, reject) => {
     worker.onerror = reject;
     worker.onmessage = ({ data: { found, failure } }) => { if (found) resolve(found); else reject(new Error(failure)); };
-    worker.postMessage({ wasm: module, file: bytesFrom(text), facts });
+    worker.postMessage({ wasm: module, file: bytesFrom(text), tables: tables && bytesFrom(tables.textContent), facts });
   }).finally(() => worker.terminate());
 }
 

@@ -13,8 +13,8 @@ function fail(error) {
 
 async function begin() {
   const canvas = find('canvas');
-  const gaussians = await gaussiansOf(find('gaussians').textContent, find('decoder'), find('wasm'), facts);
-  for (const id of ['gaussians', 'decoder', 'wasm']) find(id)?.remove();
+  const gaussians = await gaussiansOf(find('gaussians').textContent, find('decoder'), find('wasm'), find('tables'), facts);
+  for (const id of ['gaussians', 'decoder', 'wasm', 'tables']) find(id)?.remove();
   const sources = { vertex: find('vertex').textContent.trim(), fragment: find('fragment').textContent.trim() };
   const renderer = new Renderer(canvas, gaussians, facts, sources, still);
   const worker = new Worker(URL.createObjectURL(new Blob([find('worker').textContent], { type: 'text/javascript' })));

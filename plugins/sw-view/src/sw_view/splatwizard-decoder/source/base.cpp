@@ -1,5 +1,7 @@
 #include "base.h"
 
+#include <new>
+
 namespace swz {
 
 Text refusal;
@@ -93,11 +95,20 @@ uint64_t Bytes::varint(uint64_t limit) {
 
 }  // namespace swz
 
-// What the kernels throw when memory runs out ends the decoding too.
+// What the kernels throw when memory runs out ends the decoding too. In place of the library's, which brings printf along.
 extern "C" {
 void* __cxa_allocate_exception(size_t) noexcept {
   swz::blamed = swz::part = nullptr;
   swz::refuse("the decoder has no more memory");
 }
 void __cxa_throw(void*, void*, void (*)(void*)) { __builtin_trap(); }
+void __cxa_pure_virtual() { __builtin_trap(); }
 }
+
+void* operator new(size_t bytes) {
+  void* found = std::malloc(bytes ? bytes : 1);
+  if (found == nullptr) __cxa_allocate_exception(0);
+  return found;
+}
+void operator delete(void* data) noexcept { std::free(data); }
+void operator delete(void* data, size_t) noexcept { std::free(data); }

@@ -89,6 +89,13 @@ uint32_t crc32(const void* data, int64_t bytes, uint32_t before = 0);
 
 inline int64_t unzigzag(uint64_t value) { return static_cast<int64_t>(value >> 1) ^ -static_cast<int64_t>(value & 1); }
 
+inline double power_of_two(int exponent) {
+  const uint64_t bits = static_cast<uint64_t>(1023 + exponent) << 52;
+  double value;
+  std::memcpy(&value, &bits, 8);
+  return value;
+}
+
 // Class with m mantissa bits (docs/bitstream.md, building blocks): how many low bits are left over, and the smallest
 // integer of the class.
 inline int64_t class_bits(int64_t number, int mantissa) {
