@@ -103,7 +103,7 @@ def in_node(paths: list[Path], into: Path | None = None) -> list[tuple[str | Non
 
 
 def with_crcs(data: bytes, name: str, change: dict[int, int], **static: object) -> bytes:
-    """The file with some bytes of a section or header values changed, so that no CRC-32 of the container tells of it."""
+    """The file with some bytes of a section or header values changed, so that no CRC-32 of the container tells."""
     from splatwizard_core.coding.container import ContainerWriter
 
     reader = ContainerReader(data)

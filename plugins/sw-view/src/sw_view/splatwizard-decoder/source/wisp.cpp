@@ -468,6 +468,7 @@ void decode_wisp(Container& file) {
     walk.packet(order.packets[i], content);
   }
   walk.finish();
+  context->forget();
   {
     const Blame blame("networks");
     put_gaussians(walk.splats, looks, tables);

@@ -70,6 +70,7 @@ struct Context {
   virtual void learn(Span columns, Rows rows, const Splats& splats) = 0;
   // Refined numbers became finer than `before` [rows, 9].
   virtual void refine(Rows rows, const int64_t* before, const Splats& splats) = 0;
+  virtual void forget() {}  // gives back its memory: nothing is asked any more
 
  protected:
   ~Context() = default;

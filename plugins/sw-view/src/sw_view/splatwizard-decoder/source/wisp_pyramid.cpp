@@ -237,6 +237,12 @@ struct Pyramid final : Context {
     }
   }
 
+  void forget() override {
+    base = Sums{BASE_WIDTH}, view = Sums{VIEW_WIDTH};
+    for (Buffer<int64_t>* each : {&fine_codes, &leaf, &keys, &parent, &depth}) *each = {};
+    by_place = {}, means = {}, needed = {};
+  }
+
   void refine(Rows rows, const int64_t* before, const Splats& splats) override {
     Buffer<int64_t> number(rows.count), changes(REFINED.width() * rows.count);
     for (int64_t i = 0; i < rows.count; ++i) {
