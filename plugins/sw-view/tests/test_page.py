@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import html
 import json
 import re
@@ -191,6 +192,19 @@ def test_a_model_that_is_not_that_of_its_file_is_packed(monkeypatch, change):
     packed = replace(pack(model), text="a" * 20_000)
     monkeypatch.setattr(coded_file, "_decoder", lambda **_: "")
     assert with_file(model, packed) is packed
+
+
+def test_the_policy_of_a_page_allows_its_own_script_and_style_alone(tmp_path):
+    write_page(of_file("3dgs_classes_v1"), tmp_path / "x.html", About("toy"), None)
+    page = (tmp_path / "x.html").read_text("utf-8")
+    (policy,) = re.findall(r'<meta http-equiv="Content-Security-Policy" content="(.*?)">', page)
+    inline = re.findall(r"<script>(.*?)</script>|<style>(.*?)</style>", page, re.DOTALL)
+    hashes = [base64.b64encode(hashlib.sha256("".join(part).encode()).digest()).decode() for part in inline]
+    assert len(hashes) == 2
+    assert policy.startswith("default-src 'none'; ")
+    assert all(f"'sha256-{each}'" in policy for each in hashes)
+    assert "unsafe-inline" not in policy
+    assert "http" not in policy
 
 
 def test_the_decoder_in_the_page_is_the_module_that_is_shipped():
