@@ -256,7 +256,7 @@ def test_a_file_with_cuts_is_read_up_to_each_of_them(wasmtime, path):
         wanted = decode_model(ContainerReader(data, prefix=Prefix(packets=number)), load_plugins()).parameter_hash()
         assert wasmtime.told(data, packets=number) == (wanted, None)
         assert wasmtime.told(data[: reader.header_bytes + cut.bytes]) == (wanted, None)
-    assert wasmtime.told(data, packets=9)[1] == f"it has {len(reader.cuts)} packets, 9 are asked for"
+    assert wasmtime.told(data, packets=99)[1] == f"it has {len(reader.cuts)} packets, 99 are asked for"
 
 
 @needs_node
@@ -275,6 +275,31 @@ def test_a_file_it_does_not_know_is_refused_by_name(wasmtime):
         found, reason = wasmtime.told(path.read_bytes())
         assert found is None
         assert reason.startswith("this decoder does not know the "), path
+
+
+def rate_points() -> list[bytes]:
+    """A file for each rate point of every method that the decoder knows, of the Gaussians of its first golden file."""
+    spec = importlib.util.spec_from_file_location("make_golden", GOLDEN[0].parent / "make_golden.py")
+    golden = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(golden)
+    plugins, found, seen = load_plugins(), [], set()
+    for name in (path.stem for path in COVERED):
+        if name not in golden.CASES or golden.CASES[name][0] in seen:
+            continue
+        method, _, values, model = golden.CASES[name]
+        seen.add(method)
+        for rate in plugins.methods.load(method).RATES:
+            golden.CASES[name] = (method, rate, values, model)
+            found.append(golden.encoded(name))
+    return found
+
+
+@needs_wasmtime
+def test_every_rate_point_has_the_hash_of_the_python_decoder(wasmtime):
+    files = [data for data in rate_points() if covers(ContainerReader(data))]
+    assert len({ContainerReader(data).method for data in files}) >= 13
+    assert len(files) > 60
+    assert [wasmtime.told(data) for data in files] == [told(data) for data in files]
 
 
 @needs_node

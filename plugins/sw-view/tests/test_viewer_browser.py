@@ -153,7 +153,9 @@ def test_a_page_that_holds_the_file_shows_what_one_of_packed_gaussians_shows(bro
     assert pictures[0].std() > 0.05
 
 
-@pytest.mark.parametrize(("name", "first"), [("3dgs_packets_v1", "coarse"), ("wisp_v1", "drawn")])
+@pytest.mark.parametrize(
+    ("name", "first"), [("3dgs_packets_v1", "coarse"), ("wisp_packets_v2", "coarse"), ("wisp_v1", "drawn")]
+)
 def test_a_file_with_cuts_is_shown_coarse_first(browser, tmp_path, monkeypatch, name, first):
     """Its first cut, then all of it: what a page of its Gaussians shows."""
     model, _ = open_model(GOLDEN / f"{name}.swz", load_plugins(), torch.device("cpu"))
