@@ -1,7 +1,7 @@
 """Build the WebAssembly decoder of .swz files that sw-view ships, from the kernels of the CPU libraries.
 
     pip install ziglang==0.17.1
-    python tools/build_decoder.py            # writes decoder.wasm and build.json
+    python tools/build_decoder.py            # writes decoder.wasm, exact_tables.zlib, build.json
     python tools/build_decoder.py --check    # exits with 1 if a build here gives other bytes
 
 `build.json` holds the command, the version of the compiler, and SHA-256 of the sources and of the module, so that a
@@ -18,21 +18,25 @@ import re
 import subprocess
 import sys
 import tempfile
+import zlib
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = Path("plugins/sw-view/src/sw_view/splatwizard-decoder")
 KERNELS = Path("plugins/sw-codecs/src/sw_codecs/exact_kernels")
+ALONE = FOLDER / "source" / "alone"
 SHARED = Path("splatwizard-native/src/splatwizard_native/include")
-USED_KERNELS = ("octree.cpp",)
+TABLES = Path("plugins/sw-codecs/src/sw_codecs/data/exact_tables.bin")
+USED_KERNELS = ("octree.cpp", "leaf_octree.cpp", "network.cpp", "sessions.cpp")
+WISP = Path("plugins/sw-wisp/src/sw_wisp")
 ZIGLANG = "0.17.1"
 MOST_MEMORY = 1 << 30
 STACK = 1 << 19
 FLAGS = (
     "-target", "wasm32-wasi", "-mexec-model=reactor", "-std=c++20", "-Os", "-msimd128", "-ffp-contract=off",
     "-fno-rtti", "-s", "-DSW_ARCH=arch_native", f"-Wl,--max-memory={MOST_MEMORY}", f"-Wl,-z,stack-size={STACK}",
-    "-isystem", str(SHARED), "-I", str(KERNELS),
+    "-I", str(ALONE), "-isystem", str(SHARED), "-I", str(KERNELS), "-I", str(WISP),
 )  # fmt: skip
 INCLUDE = re.compile(r'^#include ["<]([\w./]+)[">]', re.MULTILINE)
 
@@ -40,7 +44,7 @@ INCLUDE = re.compile(r'^#include ["<]([\w./]+)[">]', re.MULTILINE)
 def sources() -> list[Path]:
     """Return what is compiled, relative to the repository."""
     own = sorted(path.relative_to(ROOT) for path in (ROOT / FOLDER / "source").glob("*.cpp"))
-    return [*own, *(KERNELS / name for name in USED_KERNELS)]
+    return [*own, *(KERNELS / name for name in USED_KERNELS), WISP / "exact_kernels" / "pyramid.cpp"]
 
 
 def with_headers(paths: list[Path]) -> list[Path]:
@@ -53,7 +57,7 @@ def with_headers(paths: list[Path]) -> list[Path]:
             continue
         found[path] = None
         for name in INCLUDE.findall((ROOT / path).read_text(encoding="utf-8")):
-            places = (path.parent / name, KERNELS / name, SHARED / name)
+            places = (path.parent / name, KERNELS / name, WISP / name, ALONE / name, SHARED / name)
             waiting += [place for place in places if (ROOT / place).is_file()][:1]
     return sorted(found)
 
@@ -87,6 +91,10 @@ def main() -> None:
     parser.add_argument("--check", action="store_true", help="compare with what is shipped, write nothing")
     checks = parser.parse_args().check
     module, facts = ROOT / FOLDER / "decoder.wasm", ROOT / FOLDER / "build.json"
+    tables = ROOT / TABLES
+    packed = ROOT / FOLDER / "exact_tables.zlib"
+    if not packed.is_file() or zlib.decompress(packed.read_bytes()) != tables.read_bytes():
+        packed.write_bytes(zlib.compress(tables.read_bytes(), 9))
     with tempfile.TemporaryDirectory() as folder:
         built = Path(folder) / "decoder.wasm"
         found = build(built)

@@ -42,6 +42,7 @@ FOLDER = Path(sw_view.__file__).parent / "splatwizard-decoder"
 GOLDEN = sorted((ROOT / "tests" / "golden").glob("*.swz"))
 PACKETS = ROOT / "tests" / "golden" / "3dgs_packets_v1.swz"
 COVERED = [path for path in GOLDEN if covers(ContainerReader.open(path))]
+WITH_CUTS = [path for path in COVERED if ContainerReader.open(path).cuts]
 needs_wasmtime = pytest.mark.skipif(importlib.util.find_spec("wasmtime") is None, reason="wasmtime is not installed")
 needs_node = pytest.mark.skipif(shutil.which("node") is None, reason="Node is not installed")
 needs_ziglang = pytest.mark.skipif(importlib.util.find_spec("ziglang") is None, reason="ziglang is not installed")
@@ -69,6 +70,7 @@ class Wasmtime:
 
         self.api, self.engine = wasmtime, wasmtime.Engine()
         self.module = wasmtime.Module.from_file(self.engine, str(FOLDER / "decoder.wasm"))
+        self.tables = (FOLDER / "exact_tables.zlib").read_bytes()
 
     def told(self, data: bytes, memory: int = -1, packets: int = 0) -> tuple[str | None, str | None]:
         """Hash or reason; `memory` is the most bytes that the instance may have."""
@@ -82,6 +84,7 @@ class Wasmtime:
 
         try:
             exports["memory"].write(store, data, exports["swz_input"](store, len(data)))
+            exports["memory"].write(store, self.tables, exports["swz_tables"](store, len(self.tables)))
             exports["swz_decode"](store, packets)
         except self.api.Trap:
             return None, text(exports["swz_refusal"](store))
@@ -99,13 +102,13 @@ def in_node(paths: list[Path], into: Path | None = None) -> list[tuple[str | Non
     return [tuple(json.loads(line)[:2]) for line in done.stdout.splitlines()]
 
 
-def with_crcs(data: bytes, name: str, change: dict[int, int]) -> bytes:
-    """The file with some bytes of a section changed, so that no CRC-32 of the container tells of it."""
+def with_crcs(data: bytes, name: str, change: dict[int, int], **static: object) -> bytes:
+    """The file with some bytes of a section or header values changed, so that no CRC-32 of the container tells."""
     from splatwizard_core.coding.container import ContainerWriter
 
     reader = ContainerReader(data)
     writer = ContainerWriter(reader.method, reader.version, raster=reader.raster)
-    writer.static.update(reader.static)
+    writer.static.update({**reader.static, **static})
     for each in reader.sections:
         content = bytearray(reader.section(each))
         if each == name:
@@ -122,7 +125,7 @@ def tampered() -> list[bytes]:
 
 
 DAMAGED = ("3dgs_r3_v1", "3dgs_exact_v1", "c3dgs_v1", "lightgaussian_ranged_v1", "mesongs_v1", "chimerags_uniform16_v1",
-           "3dgs_packets_v1")  # fmt: skip
+           "3dgs_packets_v1", "wisp_v1", "wisp_none_v1")  # fmt: skip
 
 
 def damages(data: bytes) -> list[bytes]:
@@ -244,15 +247,16 @@ def test_the_reason_reaches_javascript(tmp_path):
 
 
 @needs_wasmtime
-def test_a_file_with_cuts_is_read_up_to_each_of_them(wasmtime):
-    data = PACKETS.read_bytes()
+@pytest.mark.parametrize("path", WITH_CUTS, ids=lambda path: path.stem)
+def test_a_file_with_cuts_is_read_up_to_each_of_them(wasmtime, path):
+    data = path.read_bytes()
     reader = ContainerReader(data)
-    assert len(reader.cuts) > 2
+    assert len(reader.cuts) >= 2
     for number, cut in enumerate(reader.cuts, 1):
         wanted = decode_model(ContainerReader(data, prefix=Prefix(packets=number)), load_plugins()).parameter_hash()
         assert wasmtime.told(data, packets=number) == (wanted, None)
         assert wasmtime.told(data[: reader.header_bytes + cut.bytes]) == (wanted, None)
-    assert wasmtime.told(data, packets=9)[1] == f"it has {len(reader.cuts)} packets, 9 are asked for"
+    assert wasmtime.told(data, packets=99)[1] == f"it has {len(reader.cuts)} packets, 99 are asked for"
 
 
 @needs_node
@@ -271,6 +275,48 @@ def test_a_file_it_does_not_know_is_refused_by_name(wasmtime):
         found, reason = wasmtime.told(path.read_bytes())
         assert found is None
         assert reason.startswith("this decoder does not know the "), path
+
+
+def rate_points() -> list[bytes]:
+    """A file for each rate point of every method that the decoder knows, of the Gaussians of its first golden file."""
+    spec = importlib.util.spec_from_file_location("make_golden", GOLDEN[0].parent / "make_golden.py")
+    golden = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(golden)
+    plugins, found, seen = load_plugins(), [], set()
+    for name in (path.stem for path in COVERED):
+        if name not in golden.CASES or golden.CASES[name][0] in seen:
+            continue
+        method, _, values, model = golden.CASES[name]
+        seen.add(method)
+        for rate in plugins.methods.load(method).RATES:
+            golden.CASES[name] = (method, rate, values, model)
+            found.append(golden.encoded(name))
+    return found
+
+
+@needs_wasmtime
+def test_every_rate_point_has_the_hash_of_the_python_decoder(wasmtime):
+    files = [data for data in rate_points() if covers(ContainerReader(data))]
+    assert len({ContainerReader(data).method for data in files}) >= 13
+    assert len(files) > 60
+    assert [wasmtime.told(data) for data in files] == [told(data) for data in files]
+
+
+@needs_node
+def test_decimal_numbers_of_a_header_are_rounded_as_in_python(tmp_path):
+    """Where the root cube of wisp stands: means are float64 arithmetic of it, rounded once."""
+    plain, paths = (GOLDEN[0].parent / "wisp_none_v1.swz").read_bytes(), []
+    random = np.random.default_rng(0)
+    for number in range(20):
+        low = [float(x) for x in random.uniform(-1, 1, 3) * 10.0 ** random.integers(-18, 18, 3)]
+        data = with_crcs(plain, "networks", {}, low=low, edge=float(10.0 ** random.uniform(-9, 9)))
+        (tmp_path / f"{number}.swz").write_bytes(data)
+        paths.append(tmp_path / f"{number}.swz")
+    (tmp_path / "into").mkdir()
+    in_node(paths, tmp_path / "into")
+    for path in paths:
+        means = decode_model(ContainerReader.open(path), load_plugins()).means.detach().numpy()
+        assert (np.fromfile(tmp_path / "into" / path.name, "<f4", means.size) == means.ravel()).all()
 
 
 @needs_wasmtime

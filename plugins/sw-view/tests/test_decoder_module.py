@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import json
+import zlib
 from pathlib import Path
 
 import sw_view
@@ -28,6 +29,10 @@ def test_the_shipped_module_is_built_from_these_sources():
     assert BUILT["sources"] == builder().sources_hash(), AGAIN
     module = (FOLDER / "decoder.wasm").read_bytes()
     assert (BUILT["bytes"], BUILT["sha256"]) == (len(module), hashlib.sha256(module).hexdigest()), AGAIN
+
+
+def test_it_has_the_tables_of_sw_codecs():
+    assert zlib.decompress((FOLDER / "exact_tables.zlib").read_bytes()) == (ROOT / builder().TABLES).read_bytes()
 
 
 def test_it_is_small():

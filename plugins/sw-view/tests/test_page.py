@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import html
 import json
 import re
@@ -24,6 +25,7 @@ from sw_view.page_file import About, write_page
 from splatwizard_core.api import GaussianModel
 from splatwizard_core.cli.main import main
 from splatwizard_core.tooling import load_plugins, open_model
+from sw_codecs.entropy.exact_tables import exact_tables
 
 GOLDEN = Path(__file__).parents[3] / "tests" / "golden"
 
@@ -172,13 +174,14 @@ def of_file(name: str) -> GaussianModel:
     return model
 
 
-def test_a_page_holds_the_file_where_that_is_smaller(monkeypatch):
-    model, data = of_file("3dgs_classes_v1"), (GOLDEN / "3dgs_classes_v1.swz").read_bytes()
+@pytest.mark.parametrize("name", ["3dgs_classes_v1", "wisp_v1"])
+def test_a_page_holds_the_file_where_that_is_smaller(monkeypatch, name):
+    model, data = of_file(name), (GOLDEN / f"{name}.swz").read_bytes()
     packed = replace(pack(model), text="a" * 20_000)  # as if its Gaussians were no small family
-    monkeypatch.setattr(coded_file, "_decoder", lambda: "<script></script>")
+    monkeypatch.setattr(coded_file, "_decoder", lambda **_: "<script></script>")
     assert base64.b64decode(with_file(model, packed).text) == data
     assert with_file(model, packed).facts == {**packed.facts, "reach": packed.reach}
-    monkeypatch.setattr(coded_file, "_decoder", lambda: " " * 10_000)
+    monkeypatch.setattr(coded_file, "_decoder", lambda **_: " " * 20_000)
     assert with_file(model, packed) is packed
 
 
@@ -187,8 +190,21 @@ def test_a_model_that_is_not_that_of_its_file_is_packed(monkeypatch, change):
     model = of_file("3dgs_classes_v1")
     model.origin = {**model.origin, **change}
     packed = replace(pack(model), text="a" * 20_000)
-    monkeypatch.setattr(coded_file, "_decoder", lambda: "")
+    monkeypatch.setattr(coded_file, "_decoder", lambda **_: "")
     assert with_file(model, packed) is packed
+
+
+def test_the_policy_of_a_page_allows_its_own_script_and_style_alone(tmp_path):
+    write_page(of_file("3dgs_classes_v1"), tmp_path / "x.html", About("toy"), None)
+    page = (tmp_path / "x.html").read_text("utf-8")
+    (policy,) = re.findall(r'<meta http-equiv="Content-Security-Policy" content="(.*?)">', page)
+    inline = re.findall(r"<script>(.*?)</script>|<style>(.*?)</style>", page, re.DOTALL)
+    hashes = [base64.b64encode(hashlib.sha256("".join(part).encode()).digest()).decode() for part in inline]
+    assert len(hashes) == 2
+    assert policy.startswith("default-src 'none'; ")
+    assert all(f"'sha256-{each}'" in policy for each in hashes)
+    assert "unsafe-inline" not in policy
+    assert "http" not in policy
 
 
 def test_the_decoder_in_the_page_is_the_module_that_is_shipped():
@@ -196,4 +212,8 @@ def test_the_decoder_in_the_page_is_the_module_that_is_shipped():
     (module,) = re.findall(r'<script type="text/plain" id="wasm">(.*?)</script>', text)
     assert zlib.decompress(base64.b64decode(module)) == (coded_file.FOLDER / "decoder.wasm").read_bytes()
     assert text.count("</script>") == 2
+    (tables,) = re.findall(
+        r'<script type="text/plain" id="tables">(.*?)</script>', coded_file._decoder(has_tables=True)
+    )
+    assert zlib.crc32(zlib.decompress(base64.b64decode(tables))[:-4]) == exact_tables().crc
     assert "export " not in text

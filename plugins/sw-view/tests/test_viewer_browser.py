@@ -22,6 +22,7 @@ from headless_chromium import WEBGL, Chromium, find_chromium
 from PIL import Image
 from sw_gaussians.surfels import gaussians_of
 from sw_view.entries import Opened, find_entries, open_entry
+from sw_view.packing import pack
 from sw_view.page_file import About, write_page, write_pair
 from sw_view.shown_cameras import surroundings_of
 from sw_view.shown_models import shown_model
@@ -31,6 +32,13 @@ from splatwizard_core.tooling import Choices, NegotiatedRasterizer, load_plugins
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(find_chromium() is None, reason="no Chromium is installed")]
 GOLDEN = Path(__file__).parents[3] / "tests" / "golden"
+
+NOTES_STATES = """
+globalThis.seen = [];
+document.addEventListener('DOMContentLoaded', () => new MutationObserver(() => {
+  seen.push(document.documentElement.dataset.state);
+}).observe(document.documentElement, { attributes: true, attributeFilter: ['data-state'] }));
+"""
 
 
 @pytest.fixture(scope="module")
@@ -110,7 +118,7 @@ def test_the_page_shows_what_the_rasterizer_draws(browser, scene, model, tmp_pat
 def coded(request, scene, tmp_path_factory) -> GaussianModel:
     """Gaussians, or surfels, that come from a file; one of them lies too far away to be drawn."""
     draw = torch.Generator().manual_seed(5)
-    method, plugins, n = request.param, load_plugins(), 20_000
+    method, plugins, n = request.param, load_plugins(), 40_000 if request.param == "mesongs" else 20_000
     codec, settings = ("raht", {"vq_steps": 1}) if method == "mesongs" else ("gaussians-quantized", {})
     axes = 2 if method == "2dgs" else 3
     xyz = scene.points.xyz[torch.randint(len(scene.points.xyz), (n,), generator=draw)]
@@ -143,6 +151,30 @@ def test_a_page_that_holds_the_file_shows_what_one_of_packed_gaussians_shows(bro
         assert all(url.startswith("blob:") for url in browser.requests()[1:])
     assert psnr(*pictures) > 50  # places are exact in one of them
     assert pictures[0].std() > 0.05
+
+
+@pytest.mark.parametrize(
+    ("name", "first"), [("3dgs_packets_v1", "coarse"), ("wisp_packets_v2", "coarse"), ("wisp_v1", "drawn")]
+)
+def test_a_file_with_cuts_is_shown_coarse_first(browser, tmp_path, monkeypatch, name, first):
+    """Its first cut, then all of it: what a page of its Gaussians shows."""
+    model, _ = open_model(GOLDEN / f"{name}.swz", load_plugins(), torch.device("cpu"))
+    pages = [tmp_path / name for name in ("coded.html", "packed.html")]
+    packed = pack(model)
+    write_page(model, pages[1], About("toy"), None)
+    with monkeypatch.context() as patched:
+        patched.setattr("sw_view.page_file.pack", lambda _: replace(packed, text="a" * 400_000))
+        write_page(model, pages[0], About("toy"), None)
+    slow = pages[0].read_text().replace("tell(0, true);", "setTimeout(() => tell(0, true), 500);")
+    pages[0].write_text(slow)
+    added = browser.send("Page.addScriptToEvaluateOnNewDocument", source=NOTES_STATES)
+    browser.open(at(pages[0].as_uri()), width=800)
+    wait_for(browser, "document.documentElement.dataset.state === 'drawn'")
+    states = browser.ask("seen")
+    browser.send("Page.removeScriptToEvaluateOnNewDocument", identifier=added["identifier"])
+    assert states[0] == first
+    assert states[-1] == "drawn"
+    assert psnr(*(still(browser, page, 0, (160, 120)) for page in pages)) > 45
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2])
@@ -235,6 +267,16 @@ def test_both_halves_of_a_page_of_two_are_drawn_and_move_together(browser, scene
             assert half.std() > 0.05
             assert psnr(half, shown(alone, 639, camera)) > 40
     assert psnr(both[:, :639], both[:, 641:]) < 25  # two models, not one twice
+
+    wide = [shown(page, 1280, 1) for page in pages[:2]]
+    shown(pages[2], 1280, 1)
+    slide = "s => { s.value = 25; s.dispatchEvent(new Event('input')); }"
+    browser.ask(f"document.getElementById('over').click(), ({slide})(document.getElementById('share'))")
+    time.sleep(1.0)  # drawn again at the new size
+    browser.picture(tmp_path / "over.png", whole=False)
+    over = np.asarray(Image.open(tmp_path / "over.png").convert("RGB"), np.float64)[100:600] / 255
+    assert psnr(over[:, :318], wide[0][:, :318]) > 40
+    assert psnr(over[:, 322:], wide[1][:, 322:]) > 40
 
 
 def test_an_eye_that_sees_nothing_is_shown_the_background(browser, scene, model, tmp_path):

@@ -1,6 +1,7 @@
 """The encoded file in the page: decoded there by the WebAssembly module of splatwizard-decoder, if it knows the file.
 
-The page then holds the file as it is, and its decoder (about 50 kB of text), in place of Gaussians packed for the GPU.
+The page then holds the file as it is, and its decoder (about 100 kB of text, with the exact tables of wisp 220), in
+place of Gaussians packed for the GPU.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import zlib
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 from splatwizard_core.api import BitstreamError, ContainerReader, GaussianModel, SplatModel
 from sw_view.packing import Packed
@@ -24,6 +26,8 @@ METHODS = (
 CODECS = (
     "gaussians-exact", "gaussians-quantized", "gaussians-zstd", "gaussians-ply", "vectree", "gaussians-indexed", "raht",
 )  # fmt: skip
+WITH_TABLES = ("wisp",)
+"""Methods whose files are decoded by the exact tables (module.js)."""
 MODES = ("exact", "quantized")
 """Of `3dgs`, in place of a codec."""
 PARTS = {
@@ -42,7 +46,7 @@ def covers(reader: ContainerReader) -> bool:
         return False
     if any(reader.section(name)[:1] != b"\1" for name in VECTORS if name in reader):
         return False
-    if reader.method == "chimerags":
+    if reader.method in ("chimerags", "wisp"):
         return True
     codec, mode = static.get("codec"), static.get("mode")
     return reader.method in METHODS and (
@@ -52,17 +56,18 @@ def covers(reader: ContainerReader) -> bool:
 
 def with_file(model: SplatModel, packed: Packed) -> Packed:
     """Return what a page holds of a model: the file that it was decoded from, if that is smaller; else `packed`."""
-    data = _file_of(model)
-    if data is None:
+    found = _file_of(model)
+    if found is None:
         return packed
-    text, decoder = base64.b64encode(data).decode("ascii"), _decoder()
+    data, method = found
+    text, decoder = base64.b64encode(data).decode("ascii"), _decoder(has_tables=method in WITH_TABLES)
     if len(text) + len(decoder) >= len(packed.text):
         return packed
     return Packed(text, {**packed.facts, "reach": packed.reach}, packed.means, packed.reach, decoder)
 
 
-def _file_of(model: SplatModel) -> bytes | None:
-    """Return the .swz that a model was decoded from, if the page can decode it to the same Gaussians."""
+def _file_of(model: SplatModel) -> tuple[bytes, str] | None:
+    """Return the .swz that a model was decoded from and its method, if the page can decode it to the same Gaussians."""
     origin = model.origin if isinstance(model, GaussianModel) else {}
     path = Path(str(origin.get("file", "")))
     if path.suffix != ".swz":
@@ -74,17 +79,26 @@ def _file_of(model: SplatModel) -> bytes | None:
         return None  # it went away since; the model is still here
     # A model that was moved to the place of a scene is not that of the file any more.
     moved = origin.get("world_origin") != reader.world_origin
-    same = reader.static.get("num_gaussians") == model.num_rows + sum(origin.get("left_out", {}).values())
-    return data if covers(reader) and same and not moved else None
+    if not covers(reader):
+        return None
+    same = _count(reader) == model.num_rows + sum(origin.get("left_out", {}).values())
+    return (data, reader.method) if same and not moved else None
+
+
+def _count(reader: ContainerReader) -> Any:
+    """Return how many Gaussians a file says that it has."""
+    if reader.method == "wisp":
+        return sum(rows for _, kind, rows in reader.static["order"] if kind == "base")
+    return reader.static.get("num_gaussians")
 
 
 @cache
-def _decoder() -> str:
-    """Return the elements of the page with the decoder: a script for a worker, and the module, deflated."""
-    module = zlib.compress((FOLDER / "decoder.wasm").read_bytes(), 9)
+def _decoder(*, has_tables: bool = False) -> str:
+    """Return the elements of the page with the decoder: a script for a worker, the module, and tables, deflated."""
+    parts = {"wasm": zlib.compress((FOLDER / "decoder.wasm").read_bytes(), 9)}
+    if has_tables:
+        parts["tables"] = (FOLDER / "exact_tables.zlib").read_bytes()
     scripts = [path.read_text("utf-8") for path in (FOLDER / "module.js", FOLDER.parent / "page" / "coded.js")]
-    script = "".join(scripts).replace("\nexport ", "\n")
-    return (
-        f'<script type="text/plain" id="decoder">{script}</script>\n'
-        f'<script type="text/plain" id="wasm">{base64.b64encode(module).decode("ascii")}</script>\n'
-    )
+    texts = {"decoder": "".join(scripts).replace("\nexport ", "\n")}
+    texts |= {name: base64.b64encode(part).decode("ascii") for name, part in parts.items()}
+    return "".join(f'<script type="text/plain" id="{name}">{text}</script>\n' for name, text in texts.items())

@@ -6,6 +6,8 @@ alpha = min(0.99, ...), none below 1/255. Source: 3D Gaussian Splatting (arXiv 2
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import html
 import json
 import os
@@ -25,6 +27,10 @@ from sw_view.packing import Packed, pack
 from sw_view.shown_cameras import NamedCamera, Surroundings, surroundings_about
 
 SCRIPTS = ("data.js", "renderer.js", "camera.js", "main.js")
+POLICY = (
+    "default-src 'none'; script-src {script} 'wasm-unsafe-eval'; style-src {style}; worker-src blob:; img-src data:"
+)
+"""What the page may do (CSP): nothing but its own script, style, workers, and an empty icon. It asks no network."""
 MADE_UP = "Nothing was known of the scene's cameras: these were made up around the Gaussians, with -y as up."
 FILE_NAME = "scene.html"
 """Of a run directory; report.html has a link to it."""
@@ -101,16 +107,18 @@ def _page(packed: Packed, about: About, around: Surroundings) -> str:
     told = [f"{packed.facts['count']:,} Gaussians"]
     told += [] if about.method is None else [about.method]
     told += [] if about.size is None else [f"{about.size:,} bytes encoded"]
+    style, script = _text("style.css"), "".join(_text(name) for name in SCRIPTS)
     parts = {
+        "POLICY": POLICY.format(script=_sha256(f"\n'use strict';\n{script}"), style=_sha256(f"\n{style}")),
         "TITLE": html.escape(about.title),
-        "STYLE": _text("style.css"),
+        "STYLE": style,
         "FACTS_SHOWN": "".join(f"<span>{html.escape(each)}</span>" for each in told),
         "NOTE": html.escape(f"{about.note} Written by Splatwizard; the file needs no network.".strip()),
         "FACTS": json.dumps(facts, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
         "VERTEX": _text("splat.vert"),
         "FRAGMENT": _text("splat.frag"),
         "WORKER": _text("sort.js"),
-        "SCRIPT": "".join(_text(name) for name in SCRIPTS),
+        "SCRIPT": script,
         "GAUSSIANS": packed.text,
         "DECODER": packed.decoder,
     }
@@ -130,6 +138,11 @@ def _camera(each: NamedCamera) -> dict[str, Any]:
 
 def _numbers(values: NDArray[Any]) -> list[float]:
     return [float(f"{value:.9g}") for value in np.asarray(values, np.float64)]
+
+
+def _sha256(text: str) -> str:
+    """Return an inline script or style as a policy names it."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode('ascii')}'"
 
 
 def _text(name: str) -> str:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 
-from splatwizard_core.api import BitstreamError, Method, SceneError
+from splatwizard_core.api import BitstreamError, GaussianModel, Method, SceneError
 from sw_wisp import file
 from sw_wisp.config import WispConfig
 from sw_wisp.model import WispModel
@@ -17,6 +17,17 @@ from sw_wisp.stage import WispStage
 
 if TYPE_CHECKING:
     from splatwizard_core.api import ContainerReader, ContainerWriter, Scene, SplatModel, Stage
+
+
+class SplatsOfFile(GaussianModel):
+    """Decoded splats. Decoders agree on the integers of their file, not on the last bits of the floats."""
+
+    def __init__(self, *raw: Any, reader: ContainerReader, **named: Any) -> None:
+        super().__init__(*raw, **named)
+        self._reader = reader
+
+    def parameter_hash(self) -> str:
+        return file.decode(self._reader).digest()
 
 
 class Wisp(Method):
@@ -53,6 +64,7 @@ class Wisp(Method):
         self.check_version(reader)
         decoded = file.decode(reader)
         try:
-            return gaussians_of(decoded)
+            found = gaussians_of(decoded)
         except ValueError as error:
             raise BitstreamError(f"{reader.name}: {error}", section="networks") from error
+        return SplatsOfFile(**dict(found.named_parameters()), reader=reader)

@@ -48,10 +48,15 @@ function forGpu(arrays, facts) {
   return { means, words, harmonics: new Uint32Array(harmonics.buffer), texels };
 }
 
-self.onmessage = async ({ data: { wasm, file, facts } }) => {
+self.onmessage = async ({ data: { wasm, file, tables, facts, coarse } }) => {
   try {
-    const found = forGpu(plain(parameters(await WebAssembly.compile(wasm), file).arrays), facts);
-    self.postMessage({ found }, [found.means.buffer, found.words.buffer, found.harmonics.buffer]);
+    const module = await WebAssembly.compile(wasm);
+    const tell = (packets, whole) => {
+      const found = forGpu(plain(parameters(module, file, { tables, packets }).arrays), facts);
+      self.postMessage({ found, whole }, [found.means.buffer, found.words.buffer, found.harmonics.buffer]);
+    };
+    if (coarse && cutEnds(file).length > 1) tell(1, false);
+    tell(0, true);
   } catch (error) {
     self.postMessage({ failure: error.message });
   }

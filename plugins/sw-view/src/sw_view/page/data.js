@@ -10,15 +10,25 @@ async function unpacked(text) {
   return new Response(stream).arrayBuffer();
 }
 
-// What the page holds: the encoded file and its decoder (coded.js), or Gaussians as they are drawn.
-async function gaussiansOf(text, decoder, wasm, facts) {
-  if (!decoder) return gaussiansFrom(await unpacked(text), facts);
+// Tells of what the page holds, the encoded file and its decoder (coded.js) or Gaussians as they are drawn: of the first
+// cut of a file with cuts, if that is asked for, then of all.
+async function eachGaussians({ gaussians, decoder, wasm, tables }, facts, coarse, tell) {
+  const text = gaussians.textContent;
+  if (!decoder) return tell(gaussiansFrom(await unpacked(text), facts), true);
   const worker = new Worker(URL.createObjectURL(new Blob([decoder.textContent], { type: 'text/javascript' })));
   const module = await unpacked(wasm.textContent);
   return new Promise((resolve, reject) => {
     worker.onerror = reject;
-    worker.onmessage = ({ data: { found, failure } }) => { if (found) resolve(found); else reject(new Error(failure)); };
-    worker.postMessage({ wasm: module, file: bytesFrom(text), facts });
+    worker.onmessage = ({ data: { found, whole, failure } }) => {
+      try {
+        if (failure) throw new Error(failure);
+        tell(found, whole);
+      } catch (error) {
+        reject(error);
+      }
+      if (whole) resolve();
+    };
+    worker.postMessage({ wasm: module, file: bytesFrom(text), tables: tables && bytesFrom(tables.textContent), facts, coarse });
   }).finally(() => worker.terminate());
 }
 

@@ -11,10 +11,8 @@ function fail(error) {
   document.documentElement.dataset.state = 'failed';
 }
 
-async function begin() {
+function begin(gaussians, whole) {  // returns what takes the whole, where this is the first cut
   const canvas = find('canvas');
-  const gaussians = await gaussiansOf(find('gaussians').textContent, find('decoder'), find('wasm'), facts);
-  for (const id of ['gaussians', 'decoder', 'wasm']) find(id)?.remove();
   const sources = { vertex: find('vertex').textContent.trim(), fragment: find('fragment').textContent.trim() };
   const renderer = new Renderer(canvas, gaussians, facts, sources, still);
   const worker = new Worker(URL.createObjectURL(new Blob([find('worker').textContent], { type: 'text/javascript' })));
@@ -22,6 +20,7 @@ async function begin() {
 
   let sorting = 0, number = 0, wanted = false, drawing = 0, share = 1, last = 0, rest = 0, ordered = false;
   let hearing = true;  // also until the eye is there
+  let next = null;  // Gaussians whose order is not there yet
   const eye = new Eye(facts, () => { wanted = true; again(); if (!hearing) parent.postMessage(eye.place, '*'); });
   hearing = parent === window;
   if (!hearing) addEventListener('message', ({ data, source }) => {  // beside another model: both look from one place
@@ -65,12 +64,17 @@ async function begin() {
     const data = document.documentElement.dataset;
     data.firstFrame ||= performance.now().toFixed(1);
     data.frames = Number(data.frames || 0) + 1;
-    data.state = sorting || wanted ? 'sorting' : 'drawn';
+    data.state = !whole || next ? 'coarse' : sorting || wanted ? 'sorting' : 'drawn';
+    if (whole && !next) data.firstWhole ||= performance.now().toFixed(1);
     if (still && data.state === 'drawn') document.title = `still ${find('camera').value}`;
   }
 
   worker.onmessage = ({ data }) => {
     if (data.number === sorting) sorting = 0;
+    if (next && data.number > next.after) {
+      renderer.put(next.gaussians);
+      next = null;
+    }
     renderer.take(data.sorted);
     ordered = true;
     again();
@@ -99,6 +103,16 @@ async function begin() {
   new ResizeObserver(again).observe(canvas);
   if (still) document.body.classList.add('still');
   show(Math.min(facts.cameras.length - 1, Math.max(0, Number(asked.get('camera')) || 0)));
+  return finer => {
+    worker.postMessage({ means: finer.means }, [finer.means.buffer]);
+    next = { gaussians: finer, after: number };
+    whole = wanted = true;
+    again();
+  };
 }
 
-begin().catch(fail);
+let refine = null;
+eachGaussians(Object.fromEntries(['gaussians', 'decoder', 'wasm', 'tables'].map(id => [id, find(id)])), facts, !still, (found, whole) => {
+  if (refine) refine(found); else refine = begin(found, whole);
+  if (whole) for (const id of ['gaussians', 'decoder', 'wasm', 'tables']) find(id)?.remove();
+}).catch(fail);

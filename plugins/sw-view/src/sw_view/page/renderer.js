@@ -13,8 +13,7 @@ class Renderer {
     this.blendsHalf = Boolean(gl.getExtension('EXT_color_buffer_float') || gl.getExtension('EXT_color_buffer_half_float'));
     this.splats = this.program(sources.vertex, sources.fragment);
     this.copy = this.program(COPY_VERTEX, COPY_FRAGMENT);
-    this.texture(0, gaussians.words);
-    this.texture(1, gaussians.harmonics);
+    this.textures = [];
     this.rows = gl.createBuffer();
     this.quads = gl.createVertexArray();
     this.nothing = gl.createVertexArray();
@@ -24,8 +23,14 @@ class Renderer {
     gl.enableVertexAttribArray(row);
     gl.vertexAttribIPointer(row, 1, gl.UNSIGNED_INT, 0, 0);
     gl.vertexAttribDivisor(row, 1);
-    this.constants(gaussians);
+    this.put(gaussians);
     this.size = [0, 0];
+  }
+
+  put(gaussians) {
+    this.texture(0, gaussians.words);
+    this.texture(1, gaussians.harmonics);
+    this.constants(gaussians);
   }
 
   program(vertex, fragment) {
@@ -56,7 +61,8 @@ class Renderer {
     const padded = new Uint32Array(4 * width * height);
     padded.set(words);
     gl.activeTexture(gl.TEXTURE0 + unit);
-    gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
+    gl.deleteTexture(this.textures[unit] ?? null);
+    gl.bindTexture(gl.TEXTURE_2D, this.textures[unit] = gl.createTexture());
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32UI, width, height, 0, gl.RGBA_INTEGER, gl.UNSIGNED_INT, padded);
     for (const key of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, key, gl.NEAREST);
   }

@@ -16,7 +16,7 @@ export interface Gaussians {
   sh: Float32Array;
   /** The header of the file. */
   meta: Header;
-  /** SHA-256 of the decoded parameters, if it was asked for: what `sw decode --hash` prints. */
+  /** SHA-256 of the decoded parameters (of wisp: of its integers), if it was asked for: what `sw decode --hash` prints. */
   hash: string | null;
 }
 

@@ -1,19 +1,18 @@
 // splatwizard-decoder: .swz files in browsers and Node. See index.d.ts for the types.
-import { cutEnds, DecodeError, gaussians, info, parameters } from './module.js';
+import { cutEnds, DecodeError, gaussians, info, needsTables, parameters } from './module.js';
 
 export { DecodeError, info };
 
-let loading = null;
+let loading = null, loadingTables = null;
 
-async function load() {
-  const place = new URL('./decoder.wasm', import.meta.url);
+async function load(place) {
   if (place.protocol === 'file:' && globalThis.process?.versions?.node) {
     const { readFile } = await import('node:fs/promises');
-    return WebAssembly.compile(await readFile(place));
+    return readFile(place);
   }
   const response = await fetch(place);
   if (!response.ok) throw new Error(`${place}: ${response.status} ${response.statusText}`);
-  return WebAssembly.compile(await response.arrayBuffer());
+  return new Uint8Array(await response.arrayBuffer());
 }
 
 // All bytes of a source; `seen` is told what has come of a Response so far.
@@ -53,9 +52,11 @@ function inWorker(module, bytes, options, signal) {
 
 export async function decode(source, { signal, onCut, hash = false, packets = 0, worker = typeof Worker !== 'undefined' } = {}) {
   signal?.throwIfAborted();
-  const module = await (loading ??= load());
-  const decoded = async (bytes, options) => {
+  const module = await (loading ??= load(new URL('./decoder.wasm', import.meta.url)).then(WebAssembly.compile));
+  const decoded = async (bytes, own) => {
     signal?.throwIfAborted();
+    const tables = needsTables(bytes) ? await (loadingTables ??= load(new URL('./exact_tables.zlib', import.meta.url))) : null;
+    const options = { ...own, tables };
     return worker ? inWorker(module, bytes, options, signal) : gaussians(bytes, parameters(module, bytes, options));
   };
   let shown = 0, coarse = null;

@@ -32,20 +32,26 @@ export function cutEnds(bytes) {
   return (info(bytes).cuts ?? []).map(([, end]) => 14 + view.getUint32(6, true) + end);
 }
 
+const WITH_TABLES = ['wisp'];
+
+/** Whether a file is decoded by the exact tables, exact_tables.zlib. */
+export function needsTables(bytes) { return WITH_TABLES.includes(info(bytes).method); }
+
 /**
  * The parameters in a file by name, each { shape, data: Float32Array }; with `hash` the SHA-256 of them, which
- * `sw decode --hash` prints; of a file with cuts `packets` may be how many to read. An instance of the module lives for this call only, and with it all memory but the result.
+ * `sw decode --hash` prints; of a file with cuts `packets` may be how many to read. `tables` are the bytes of exact_tables.zlib, for files that need them. An instance of the module lives for this call only, and with it all memory but the result.
  */
-export function parameters(module, bytes, { hash = false, packets = 0 } = {}) {
+export function parameters(module, bytes, { hash = false, packets = 0, tables = null } = {}) {
   const { exports } = new WebAssembly.Instance(module, {});
   exports._initialize();
   const text = at => {
     const memory = new Uint8Array(exports.memory.buffer, at);
     return new TextDecoder().decode(memory.subarray(0, memory.indexOf(0)));
   };
+  const put = (content, at) => new Uint8Array(exports.memory.buffer, at, content.length).set(content);
   try {
-    const at = exports.swz_input(bytes.length);
-    new Uint8Array(exports.memory.buffer, at, bytes.length).set(bytes);
+    put(bytes, exports.swz_input(bytes.length));
+    if (tables) put(tables, exports.swz_tables(tables.length));
     exports.swz_decode(packets);
   } catch (error) {
     if (!(error instanceof WebAssembly.RuntimeError)) throw error;

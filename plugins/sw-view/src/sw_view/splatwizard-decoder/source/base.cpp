@@ -1,5 +1,7 @@
 #include "base.h"
 
+#include <new>
+
 namespace swz {
 
 Text refusal;
@@ -75,6 +77,67 @@ uint32_t crc32(const void* bytes, int64_t count, uint32_t before) {
   return ~crc;
 }
 
+namespace {
+
+constexpr size_t LARGE = 1 << 17, GRAIN = 16, PAGE = 1 << 16;
+
+// Large blocks that are free, by address; neighbours are one.
+struct Free {
+  Free* next;
+  size_t bytes;
+  char* end() { return reinterpret_cast<char*>(this) + bytes; }
+};
+Free* first_free = nullptr;
+
+void add_free(void* data, size_t bytes) {
+  Free **at = &first_free, *before = nullptr;
+  while (*at != nullptr && *at < data) before = *at, at = &before->next;
+  auto* own = static_cast<Free*>(data);
+  *own = {*at, bytes};
+  *at = own;
+  if (own->next != nullptr && own->end() == reinterpret_cast<char*>(own->next))
+    own->bytes += own->next->bytes, own->next = own->next->next;
+  if (before != nullptr && before->end() == reinterpret_cast<char*>(own))
+    before->bytes += own->bytes, before->next = own->next;
+}
+
+size_t whole_grains(size_t bytes) { return (bytes + GRAIN - 1) / GRAIN * GRAIN; }
+
+}  // namespace
+
+void* take_memory(size_t bytes) {
+  if (bytes < LARGE) return std::malloc(bytes);
+  bytes = whole_grains(bytes);
+  for (bool grown = false;; grown = true) {
+    size_t at_end = 0;
+    const size_t end = __builtin_wasm_memory_size(0) * PAGE;
+    for (Free** at = &first_free; *at != nullptr; at = &(*at)->next) {
+      Free* found = *at;
+      if (found->bytes >= bytes) {
+        if (found->bytes > bytes) {
+          auto* rest = reinterpret_cast<Free*>(reinterpret_cast<char*>(found) + bytes);
+          *rest = {found->next, found->bytes - bytes};
+          *at = rest;
+        } else {
+          *at = found->next;
+        }
+        return found;
+      }
+      if (reinterpret_cast<size_t>(found->end()) == end) at_end = found->bytes;
+    }
+    if (grown) return nullptr;
+    const size_t pages = (bytes - at_end + PAGE - 1) / PAGE, from = __builtin_wasm_memory_grow(0, pages);
+    if (from == ~size_t{0}) return nullptr;
+    add_free(reinterpret_cast<void*>(from * PAGE), pages * PAGE);
+  }
+}
+
+void give_memory(void* data, size_t bytes) {
+  if (data == nullptr) return;
+  if (bytes < LARGE) return std::free(data);
+  add_free(data, whole_grains(bytes));
+}
+
 uint64_t Bytes::varint(uint64_t limit) {
   uint64_t value = 0;
   for (int i = 0; i < 10; ++i) {
@@ -93,11 +156,20 @@ uint64_t Bytes::varint(uint64_t limit) {
 
 }  // namespace swz
 
-// What the kernels throw when memory runs out ends the decoding too.
+// What the kernels throw when memory runs out ends the decoding too. In place of the library's, which brings printf along.
 extern "C" {
 void* __cxa_allocate_exception(size_t) noexcept {
   swz::blamed = swz::part = nullptr;
   swz::refuse("the decoder has no more memory");
 }
 void __cxa_throw(void*, void*, void (*)(void*)) { __builtin_trap(); }
+void __cxa_pure_virtual() { __builtin_trap(); }
 }
+
+void* operator new(size_t bytes) {
+  void* found = std::malloc(bytes ? bytes : 1);
+  if (found == nullptr) __cxa_allocate_exception(0);
+  return found;
+}
+void operator delete(void* data) noexcept { std::free(data); }
+void operator delete(void* data, size_t) noexcept { std::free(data); }

@@ -57,6 +57,10 @@ struct Blame {
   Blame(const Blame&) = delete;
 };
 
+// Memory, or null. The C library rounds large blocks up to powers of two; these are as long as they are asked for.
+void* take_memory(size_t bytes);
+void give_memory(void* data, size_t bytes);
+
 // Memory of a fixed number of values, not initialised.
 template <class T>
 struct Buffer {
@@ -66,21 +70,23 @@ struct Buffer {
   Buffer() = default;
   explicit Buffer(int64_t count) : size(count) {
     const auto most = static_cast<int64_t>(INT32_MAX / sizeof(T));
-    data = count > most ? nullptr : static_cast<T*>(std::malloc(sizeof(T) * static_cast<size_t>(count > 0 ? count : 1)));
+    data = count > most ? nullptr : static_cast<T*>(take_memory(bytes()));
     if (data == nullptr) {
       blamed = part = nullptr;
       refuse("the decoder has no more memory");
     }
   }
-  ~Buffer() { std::free(data); }
+  ~Buffer() { give_memory(data, bytes()); }
   Buffer(const Buffer&) = delete;
   Buffer& operator=(const Buffer&) = delete;
   Buffer(Buffer&& other) noexcept : data(other.data), size(other.size) { other.data = nullptr; }
   Buffer& operator=(Buffer&& other) noexcept {
     T* mine = data;
-    data = other.data, size = other.size, other.data = mine;
+    const int64_t count = size;
+    data = other.data, size = other.size, other.data = mine, other.size = count;
     return *this;
   }
+  size_t bytes() const { return sizeof(T) * static_cast<size_t>(size > 0 ? size : 1); }
   T& operator[](int64_t i) const { return data[i]; }
   void clear() const { std::memset(data, 0, sizeof(T) * static_cast<size_t>(size)); }
 };
@@ -88,6 +94,13 @@ struct Buffer {
 uint32_t crc32(const void* data, int64_t bytes, uint32_t before = 0);
 
 inline int64_t unzigzag(uint64_t value) { return static_cast<int64_t>(value >> 1) ^ -static_cast<int64_t>(value & 1); }
+
+inline double power_of_two(int exponent) {
+  const uint64_t bits = static_cast<uint64_t>(1023 + exponent) << 52;
+  double value;
+  std::memcpy(&value, &bits, 8);
+  return value;
+}
 
 // Class with m mantissa bits (docs/bitstream.md, building blocks): how many low bits are left over, and the smallest
 // integer of the class.

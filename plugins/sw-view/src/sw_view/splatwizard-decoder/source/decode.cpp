@@ -1,6 +1,8 @@
-// What the module exports. A host gets `swz_input(bytes)`, writes the file there, and calls `swz_decode`; if that traps,
+// What the module exports. A host gets `swz_input(bytes)`, writes the file there, for some methods `swz_tables(bytes)`
+// with what exact_tables.h says, and calls `swz_decode`; if that traps,
 // `swz_refusal` is the reason, or empty if the module itself failed. Then `swz_arrays` are read and copied, and the
 // instance is thrown away: it decodes one file.
+#include "exact_tables.h"
 #include "gaussian_files.h"
 #include "model.h"
 #include "sha256.h"
@@ -34,6 +36,7 @@ constexpr Codec CODECS[] = {{"gaussians-exact", decode_exact}, {"gaussians-quant
 // Without a codec a file of 3dgs states its mode.
 void (*decoder_of(const Container& file))(Container& file) {
   if (file.method->is("chimerags")) return decode_chimera;
+  if (file.method->is("wisp")) return decode_wisp;
   bool by_a_codec = false;
   for (const char* method : BY_A_CODEC) by_a_codec |= file.method->is(method);
   if (!by_a_codec) lacks("method", file.method);
@@ -62,6 +65,12 @@ EXPORT(swz_input) uint8_t* swz_input(int32_t bytes) {
   return input.data;
 }
 
+// Where the host puts the exact tables, a zlib stream of so many bytes, if the file needs them.
+EXPORT(swz_tables) uint8_t* swz_tables(int32_t bytes) {
+  packed_tables = Buffer<uint8_t>(bytes);
+  return packed_tables.data;
+}
+
 // Decodes the first `packets` packets of a file with cuts; 0: all that are there.
 EXPORT(swz_decode) void swz_decode(int32_t packets) {
   Container file(Bytes{input.data, input.size}, packets);
@@ -78,7 +87,8 @@ EXPORT(swz_count) int32_t swz_count() { return decoded.count; }
 // The hash of the decoded model, 64 digits.
 EXPORT(swz_hash) const char* swz_hash() {
   Sha256 sha;
-  for (int i = 0; i < decoded.count; ++i) {
+  if (hash_of_integers != nullptr) hash_of_integers(sha);
+  for (int i = 0; i < decoded.count && hash_of_integers == nullptr; ++i) {
     if (decoded.arrays[i].is_index) continue;
     int64_t size = 4;
     for (int axis = 0; axis < decoded.arrays[i].axes; ++axis) size *= decoded.arrays[i].shape[axis];

@@ -14,6 +14,7 @@ void decode_vectree(Container& file);
 void decode_indexed(Container& file);
 void decode_raht(Container& file);
 void decode_chimera(Container& file);
+void decode_wisp(Container& file);
 
 // Rows of opacity logit, three log scales and quaternion, of Gaussians from `first` on.
 void put_attributes(const Gaussians& to, int64_t first, int64_t count, const float* attributes);

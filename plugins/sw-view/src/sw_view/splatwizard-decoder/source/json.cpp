@@ -1,5 +1,7 @@
 #include "json.h"
 
+#include "decimal.h"
+
 namespace swz {
 
 const Json* Json::find(const char* name) const {
@@ -134,7 +136,7 @@ struct Parser {
     if (at - start >= int64_t{sizeof(text)}) unacceptable("a number has too many digits");
     std::memcpy(text, start, static_cast<size_t>(at - start));
     text[at - start] = 0;
-    value.number = std::strtod(text, nullptr);
+    value.number = nearest_float64(text);
     if (!__builtin_isfinite(value.number)) unacceptable("a number is not finite");
     if (value.kind == Json::INTEGER) {
       uint64_t found = 0;

@@ -3,6 +3,7 @@
 namespace swz {
 
 Model3D decoded;
+void (*hash_of_integers)(Sha256& sha) = nullptr;
 
 float* Model3D::add(const char* name, int64_t first, int64_t second, int64_t third) {
   Array& array = arrays[count++];

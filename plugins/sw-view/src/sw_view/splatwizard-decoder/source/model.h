@@ -28,6 +28,10 @@ struct Model3D {
 
 extern Model3D decoded;
 
+struct Sha256;
+// Hashes the integers that decoders agree on, where it is not the arrays of floats; null: those.
+extern void (*hash_of_integers)(Sha256& sha);
+
 // Raw parameters of Gaussians, empty.
 struct Gaussians {
   float *means, *log_scales, *quats, *opacity_logits, *sh_dc, *sh_rest;
