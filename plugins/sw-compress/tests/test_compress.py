@@ -2,6 +2,7 @@
 
 import errno
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from sw_compress import Compressed, compress, compressing
 from sw_compress.command import compress as command
 
 from splatwizard_core.api import UserInputError
+from splatwizard_core.cli.main import main
 from splatwizard_core.tooling import ForeseenError, export_model, load_plugins, open_model, read_gaussians
 
 pytestmark = pytest.mark.pipeline
@@ -140,3 +142,48 @@ def test_a_source_is_never_replaced(source):
     done = CliRunner().invoke(command, [str(source), "--out", str(source)])
     assert isinstance(done.exception, UserInputError)
     assert "would be replaced" in str(done.exception)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "told"),
+    [
+        ("no.ply", [], "no.ply: there is no such file"),
+        ("a.txt", [], r"a.txt: of none of the formats that are read, .*\.ply, .*\.swz"),
+        ("a.ply", [], "a.ply: not a .ply file"),
+        ("empty.ply", [], "empty.ply: not a .ply file"),
+        ("folder", [], "folder is a folder, and this command takes a file"),
+        ("ball.ply", ["--size", "0"], "size '0' must be 1 byte to"),
+        ("ball.ply", ["--size", "1e400MB"], "size '1e400MB' is none: .*8MB"),
+        ("ball.ply", ["--quality", "200dB"], "quality '200dB' must be a number in 15 .. 70"),
+        ("ball.ply", ["--ratio", "0.5"], "ratio '0.5' must be a number in 1 .."),
+        ("ball.ply", ["--size", "5kB", "--ratio", "2"], "give one of them"),
+        ("ball.ply", ["--out", "no/such/a.swz"], "there is no folder no/such"),
+        ("ball.ply", ["--out", "folder"], "folder is a folder: give the name of a file in it"),
+        ("ball.ply", ["--out", "a.zip"], "a.zip: a file of this name would hold swz, .*: give --out FILE.swz"),
+        ("ball.ply", ["--out", "b.swz", "--format", "spz"], "b.swz: a file of this name would hold spz"),
+        ("ball.ply", ["--cameras", "a.txt"], "a.txt: not a JSON file of cameras"),
+    ],
+)
+def test_what_is_wrong_is_told_in_a_line_and_nothing_is_written(
+    source, tmp_path, monkeypatch, capsys, name: str, options: list[str], told: str
+):
+    (tmp_path / "folder").mkdir()
+    for other, text in (("a.txt", "hi"), ("a.ply", "hi"), ("empty.ply", "")):
+        (tmp_path / other).write_text(text)
+    (tmp_path / "ball.ply").write_bytes(source.read_bytes())
+    before = sorted(tmp_path.rglob("*"))
+    monkeypatch.chdir(tmp_path)
+    assert main(["compress", name, "--device", "cpu", *options]) == 2
+    printed = capsys.readouterr().err.strip()
+    assert re.search(told, printed)
+    assert len(printed.splitlines()) <= 2
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_the_name_of_the_result_chooses_the_format_and_an_older_file_is_replaced(source, tmp_path):
+    out = tmp_path / "a.spz"
+    out.write_bytes(b"an older file")
+    options = ["--size", "14kB", "--views", "6", "--device", "cpu", "--out", str(out)]
+    done = CliRunner().invoke(command, [str(source), *options])
+    assert done.exit_code == 0, done.output
+    assert read_gaussians(out, load_plugins()).num_rows > 100

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     click.option("--ratio", metavar="N", help="How many times smaller than the source.  [default: as --quality says]"),
     click.option("--out", metavar="PATH", type=click.Path(),
                  help="The file to write; of several files a folder.  [default: beside the source]"),
-    click.option("--format", "format_name", type=click.Choice(["swz", "sog", "spz"]), default="swz", show_default=True,
-                 help="What is written: .swz is the smallest."),
+    click.option("--format", "format_name", type=click.Choice(["swz", "sog", "spz"]),
+                 help="What is written: .swz is the smallest.  [default: by the suffix of --out, else swz]"),
     click.option("--cameras", type=EXISTING, metavar="FILE",
                  help="JSON of cameras (README of sw-view).  [default: they are made up]"),
     click.option("--views", type=click.IntRange(min=3), metavar="N",
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 )  # fmt: skip
 def compress(
     files: tuple[Path, ...], size: str | None, quality: str | None, ratio: str | None, out: str | None,
-    format_name: str, cameras: Path | None, views: int | None, gaussians: int | None, sh_degree: int | None,
+    format_name: str | None, cameras: Path | None, views: int | None, gaussians: int | None, sh_degree: int | None,
     drop_unseen: bool, device: str | None, as_json: bool,
 ) -> None:  # fmt: skip
     """Make FILE small without its photographs: fewer Gaussians, each as precise as its part in the picture asks for.
@@ -61,6 +61,7 @@ def compress(
     from sw_compress.compressing import compress as make
     from sw_compress.source import default_output
 
+    format_name = _format(format_name, out if len(files) == 1 else None)
     places = _places(files, out, f".{format_name}", default_output)
     records: list[dict[str, Any]] = []
     failed: list[ForeseenError] = []
@@ -84,6 +85,20 @@ def compress(
         print_facts(records[0] if len(files) == 1 else {"files": records}, True, "")
     if failed:
         raise click.ClickException(f"{len(failed)} of {len(files)} files failed")
+
+
+def _format(asked: str | None, out: str | None) -> str:
+    """Return the format asked for, or that of the name of the result. Raises UserInputError where they differ."""
+    from splatwizard_core.api import UserInputError
+    from sw_compress.compressing import SWZ
+    from sw_compress.formats import FORMATS
+
+    suffix = "" if out is None else Path(out).suffix.lower().removeprefix(".")
+    known = (SWZ, *FORMATS)
+    if suffix and suffix not in ((asked,) if asked else known):
+        which = asked or ", ".join(known)
+        raise UserInputError(f"{out}: a file of this name would hold {which}: give --out FILE.{asked or SWZ}")
+    return asked or suffix or SWZ
 
 
 def _places(files: tuple[Path, ...], out: str | None, suffix: str, default: Any) -> list[Path]:

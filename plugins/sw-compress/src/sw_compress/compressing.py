@@ -87,12 +87,13 @@ def compress(
     stages, plugins = Stages(), load_plugins() if plugins is None else plugins
     if format not in (SWZ, *FORMATS):
         raise UserInputError(f"format '{format}' is none of {', '.join((SWZ, *FORMATS))}")
+    Target.of(size, quality, ratio, 0)  # what is wrong with it is told before a large file is read
+    if gaussians is not None and gaussians < 1:
+        raise UserInputError(f"{gaussians} Gaussians: at least 1 must stay")
     chosen = choose_device(device, plugins)
     with stages.timed("read"):
         source = open_source(scene, plugins, chosen)
     target = Target.of(size, quality, ratio, source.file_bytes)
-    if gaussians is not None and gaussians < 1:
-        raise UserInputError(f"{gaussians} Gaussians: at least 1 must stay")
     model = source.model if sh_degree is None else with_degree(source.model, sh_degree)
     rasterizer = NegotiatedRasterizer(plugins, device=chosen, options=source.raster)
     with stages.timed("cameras"), torch.no_grad():

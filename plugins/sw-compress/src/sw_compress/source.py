@@ -56,6 +56,11 @@ def open_source(given: str | os.PathLike[str] | GaussianModel, plugins: PluginMa
     path = existing_file(str(given))
     if plugins.importers.of_suffix(path) is not None:
         return _source(path.name, read_gaussians(path, plugins).to(device), bytes_with_named(path))
+    with path.open("rb") as file:
+        is_ours = path.suffix.lower() == ".swz" or file.read(4) == b"SPWZ"
+    if not is_ours:
+        known = sorted({".swz", *(str(e.declared["suffix"]) for e in plugins.importers if "suffix" in e.declared)})
+        raise UserInputError(f"{path}: of none of the formats that are read, {', '.join(known)}")
     model, reader = open_model(path, plugins, device)
     if not isinstance(model, GaussianModel):
         raise UserInputError(

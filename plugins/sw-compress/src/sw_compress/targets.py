@@ -69,14 +69,14 @@ def parse_size(text: str | int) -> int:
 def parse_quality(text: str | float) -> float:
     """Return decibels of `45dB` or a number. Raises UserInputError."""
     spelled = re.fullmatch(r"(.*?)\s*(?:dB)?\s*", str(text), re.IGNORECASE | re.DOTALL)
-    return _number(spelled[1] if spelled else text, "quality", *QUALITIES)
+    return _number(spelled[1] if spelled else text, "quality", *QUALITIES, shown=text)
 
 
-def _number(value: str | float, what: str, low: float, high: float) -> float:
+def _number(value: str | float, what: str, low: float, high: float, *, shown: str | float | None = None) -> float:
     try:
         found = float(value)
     except ValueError:
         found = math.nan
     if not low <= found <= high:
-        raise UserInputError(f"{what} '{value}' must be a number in {low:g} .. {high:g}")
+        raise UserInputError(f"{what} '{value if shown is None else shown}' must be a number in {low:g} .. {high:g}")
     return found
