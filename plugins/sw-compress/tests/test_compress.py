@@ -138,8 +138,8 @@ def test_several_files_one_of_which_fails(source, tmp_path):
     assert "smaller than ball.ply" in done.output
 
 
-def test_a_source_is_never_replaced(source):
-    done = CliRunner().invoke(command, [str(source), "--out", str(source)])
+def test_a_source_is_never_replaced(small):
+    done = CliRunner().invoke(command, [str(small.out), "--out", str(small.out)])
     assert isinstance(done.exception, UserInputError)
     assert "would be replaced" in str(done.exception)
 
