@@ -108,7 +108,7 @@ def test_a_sweep_without_a_scene_is_about_that_of_its_start(run: Path, tmp_path:
     context = click.Context(load_plugins().commands.load("bench"))
     words = ["--method", "spz", "--seed", "0,1", "--init", str(start), "--out", str(tmp_path / "out")]
     given = context.command.make_context("bench", words).params
-    given.pop("plan"), given.pop("train_shared")
+    given.pop("paths"), given.pop("train_shared")
     assert plan_of_options(None, given).plan.scenes == ("demo:tiny",)
 
 

@@ -156,8 +156,8 @@ def test_a_newer_coded_stream(tmp_path, capsys, section):
 
 
 def newer_container(data: bytes, header: bytes) -> bytes:
-    """A file of container version 2 that keeps what every version keeps: the first 10 bytes, a JSON header, its CRC."""
-    return struct.pack("<4sHI", b"SPWZ", 2, len(header)) + header + struct.pack("<I", zlib.crc32(header)) + data
+    """A file of container version 3 that keeps what every version keeps: the first 10 bytes, a JSON header, its CRC."""
+    return struct.pack("<4sHI", b"SPWZ", 3, len(header)) + header + struct.pack("<I", zlib.crc32(header)) + data
 
 
 @pytest.mark.parametrize("command", [*COMMANDS, "info"])
@@ -166,7 +166,7 @@ def test_a_newer_container(tmp_path, capsys, monkeypatch, command):
     header = json.dumps({"requires": {"splatwizard-core": ["0.8"]}, "whatever": ["comes", "then"]}).encode()
     path = write(tmp_path, data=newer_container(b"\x00" * 50, header))
     assert said(capsys, command, path) == (
-        "error: garden.swz: container version 2 is newer than 1, the newest that this installation reads: "
+        "error: garden.swz: container version 3 is newer than 2, the newest that this installation reads: "
         "upgrade splatwizard-core with pip install 'splatwizard-core>=0.8'"
     )
 

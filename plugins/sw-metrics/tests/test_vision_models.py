@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
+import re
 import types
 
 import pytest
@@ -124,7 +125,7 @@ def test_without_its_package_a_metric_says_what_to_install(monkeypatch, name: st
 
     monkeypatch.setattr(importlib.metadata, "version", absent)
     metric = METRICS[name]
-    with pytest.raises(CapabilityError, match=rf"package-missing: pip install 'sw-metrics\[{metric.extra}\]'"):
+    with pytest.raises(CapabilityError, match=re.escape(f"package-missing: {metric.install}")):
         metric.prepare(setup())
     assert metric.identity(setup()) is None
 

@@ -185,7 +185,7 @@ def test_fresh_decoder_draws_what_training_drew(whole, plugins, toy, rasterizer)
     method, model = whole
     model = copy.deepcopy(model).eval()
     found = decoded(plugins, file_of(method, model))
-    assert type(found) is GaussianModel
+    assert isinstance(found, GaussianModel)
     assert found.num_rows == model.num_rows
     camera = toy.scene.test[0].camera
     with torch.no_grad():

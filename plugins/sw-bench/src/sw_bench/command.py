@@ -54,7 +54,7 @@ from splatwizard_core.tooling import (
                  help="Used by sweeps: train what several runs start from.  [default: none]"),
     click.option("--protocol", type=click.Choice(["mpeg-gsc"]),
                  help="Code trained models FILE... by methods that need no training, after the MPEG GSC exploration "
-                 "(2025), own renderer and cameras."),
+                 "(2025), own renderer and cameras.  [default: a sweep]"),
     click.option("--cameras", metavar="PATH", type=EXISTING,
                  help="With --protocol: a scene's folder or a file of cameras.  [default: those of FILE's comments, "
                  "else 16 around or in the model]"),

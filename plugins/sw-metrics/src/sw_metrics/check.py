@@ -55,10 +55,10 @@ def check_vision_models() -> list[Check]:
     """Tell which of the packages that metrics go through are here; none of them is needed."""
     checks = []
     for metric in dict.fromkeys(METRICS.values()):
-        names = ", ".join(name for name, each in METRICS.items() if each.extra == metric.extra)
+        names = ", ".join(name for name, each in METRICS.items() if each.package == metric.package)
         version = metric.version()
         if version is None:
-            found = Check(GROUP, metric.package, "missing", f"for {names}", f"pip install 'sw-metrics[{metric.extra}]'")
+            found = Check(GROUP, metric.package, "missing", f"for {names}", metric.install)
         else:
             found = Check(GROUP, metric.package, "ok", f"{metric.package} {version}, for {names}")
         checks.append(found)

@@ -48,13 +48,13 @@ Compute = Callable[[Tensor, Tensor], float]
 class Packaged:
     """A metric of somebody's package.
 
-    extra       of sw-metrics, which brings it
+    install     command of the extra that brings it
     package     distribution whose version the record keeps
     module      what is imported
     make        (module, setup) -> (what computes, what its values depend on besides)
     """
 
-    extra: str
+    install: str
     package: str
     module: str
     make: Callable[[Any, MetricSetup], tuple[Compute, Mapping[str, str]]]
@@ -92,7 +92,7 @@ class Packaged:
             return None
 
     def _missing(self) -> str:
-        return f"package-missing: pip install 'sw-metrics[{self.extra}]'"
+        return f"package-missing: {self.install}"
 
 
 def too_small(what: str, side: int, image: Tensor) -> None:
@@ -112,7 +112,7 @@ def of_piq(call: Callable[[Any, Tensor, Tensor], Tensor], what: str, side: int =
 
         return compute, {}
 
-    return Packaged("piq", "piq", "piq", make)
+    return Packaged("pip install 'sw-metrics[piq]'", "piq", "piq", make)
 
 
 def _flip(module: Any, setup: MetricSetup) -> tuple[Compute, Mapping[str, str]]:
@@ -144,8 +144,8 @@ def _cvvdp(module: Any, setup: MetricSetup) -> tuple[Compute, Mapping[str, str]]
     return compute, {"display": display}
 
 
-FLIP = Packaged("flip", "flip-evaluator", "flip_evaluator", _flip)
-CVVDP = Packaged("cvvdp", "cvvdp", "pycvvdp", _cvvdp)
+FLIP = Packaged("pip install 'sw-metrics[flip]'", "flip-evaluator", "flip_evaluator", _flip)
+CVVDP = Packaged("pip install 'sw-metrics[cvvdp]'", "cvvdp", "pycvvdp", _cvvdp)
 MS_SSIM = of_piq(
     lambda piq, x, y: piq.multi_scale_ssim(x, y, kernel_size=11, kernel_sigma=1.5, data_range=1.0, k1=0.01, k2=0.03),
     "MS-SSIM",

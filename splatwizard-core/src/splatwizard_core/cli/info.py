@@ -20,7 +20,7 @@ from splatwizard_core.plugins import load_plugins
 
 @click.command(short_help="what is in a file or scene")
 @click.argument("path", metavar="PATH", type=SCENE_OR_FILE)
-@click.option("--split", metavar="RULE", help="Split a scene by this rule, and draw its cameras from above: an .svg.")
+@click.option("--split", metavar="RULE", help="Split a scene by this rule, and draw it as .svg.  [default: no picture]")
 @shared.options(shared.images_option, shared.set_option, shared.json_option, shared.debug_option)
 @takes_choices
 def info(path: str, as_json: bool, chosen: Choices) -> None:
