@@ -73,8 +73,10 @@ def test_what_ends_at_no_cut_is_truncated_and_partial_takes_what_is_whole(capsys
         assert f"packet 2 ({cuts[1]['bytes']:,} bytes): --partial" in error
     whole = told(capsys, "decode", PACKETS, "--packets", 2, "--repeats", 0)
     assert told(capsys, "decode", broken, "--partial", "--repeats", 0)["digest"] == whole["digest"]
-    told(capsys, "truncate", broken, "--partial", "--out", broken)
-    assert told(capsys, "decode", broken, "--repeats", 0)["digest"] == whole["digest"]
+    assert "another file than the source" in refused(capsys, "truncate", broken, "--partial", "--out", broken)
+    mended = tmp_path / "mended.swz"
+    told(capsys, "truncate", broken, "--partial", "--out", mended)
+    assert told(capsys, "decode", mended, "--repeats", 0)["digest"] == whole["digest"]
 
 
 def test_eval_measures_each_prefix_as_the_file_that_ends_there(capsys, tmp_path):

@@ -108,6 +108,7 @@ ROWS = [
     Row("decode {grey.swz} --packets 1", "it declares no cuts"),
     Row("decode {grey.swz} --bytes much", "'much' is no size, such as 500kB"),
     Row("truncate {grey.swz} --packets 1 --out {new}.swz", "it declares no cuts"),
+    Row("decode {grey.swz} --hash --out {new}.ply", "leave out --out and --json"),
     Row("compress {grey.swz} --size much --out {new}.swz", "size 'much' is none"),
     Row("compress {cut.ply} --size 1MB --out {new}.swz", "cut.ply"),
     Row("truncate {grey.swz} --out {new}.swz", "give --packets P, --size SIZE or --partial"),

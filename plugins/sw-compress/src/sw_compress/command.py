@@ -102,7 +102,8 @@ def _format(asked: str | None, out: str | None) -> str:
 
 
 def _places(files: tuple[Path, ...], out: str | None, suffix: str, default: Any) -> list[Path]:
-    """Return the place of each result. Raises UserInputError for a place that is a source, or that two share."""
+    """Return the place of each result. Raises UserInputError for one that is a source, that two share, or,
+    where nobody named it, that is there."""
     from splatwizard_core.api import UserInputError
     from splatwizard_core.tooling import OUTPUT_FILE, OUTPUT_FOLDER
 
@@ -118,6 +119,8 @@ def _places(files: tuple[Path, ...], out: str | None, suffix: str, default: Any)
     for place in places:
         if place.resolve() in sources:
             raise UserInputError(f"{place} is a source, and would be replaced: give another --out")
+        if out is None and place.exists():
+            raise UserInputError(f"{place} is there already: give --out FILE, that one to replace it")
         if places.count(place) > 1:
             raise UserInputError(
                 f"two results would be {place}: compress them one by one, or into folders of their own"

@@ -158,7 +158,7 @@ class LayersOfTheFile(Params):
     @classmethod
     def _positive(cls, shares: list[float]) -> list[float]:
         if min(shares) <= 0:
-            raise ValueError("a share must be positive")
+            raise ValueError("shares above 0")
         return shares
 
 

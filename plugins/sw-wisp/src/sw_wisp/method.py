@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 class SplatsOfFile(GaussianModel):
     """Decoded splats. Decoders agree on the integers of their file, not on the last bits of the floats."""
 
-    def __init__(self, *raw: Any, reader: ContainerReader, **named: Any) -> None:
+    def __init__(self, *raw: Any, reader: ContainerReader | None = None, **named: Any) -> None:
         super().__init__(*raw, **named)
-        self._reader = reader
+        self._reader = reader  # None: a copy that somebody makes of some of them
 
     def parameter_hash(self) -> str:
-        return file.decode(self._reader).digest()
+        return super().parameter_hash() if self._reader is None else file.decode(self._reader).digest()
 
 
 class Wisp(Method):

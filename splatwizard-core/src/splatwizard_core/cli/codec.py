@@ -90,6 +90,8 @@ def decode(
 
     plugins = load_plugins()
     prefix = Prefix(packets, size, partial)
+    if hash_only and (out is not None or as_json):
+        raise click.UsageError("--hash prints nothing but the hash: leave out --out and --json")
     if hash_only:
         click.echo(decode_model(ContainerReader.open(file, prefix), plugins).parameter_hash())
         return

@@ -57,6 +57,8 @@ def truncate(file: Path, packets: int | None, size: int | None, partial: bool, o
     reader = ContainerReader.open(file, Prefix(packets, size, partial))
     if not reader.cuts:
         raise UserInputError(f"{file}: it declares no cuts, there is no shorter file in it")
+    if out.suffix != ".swz" or out.resolve() == file.resolve():
+        raise UserInputError(f"{out}: give --out another file than the source, with a name that ends in .swz")
     with file.open("rb") as source:
         write_atomic(out, source.read(reader.size))
     facts = {"file": str(out), "packets": reader.packets, "bytes": reader.size}
