@@ -53,10 +53,12 @@ def compress(
     """Make FILE small without its photographs: fewer Gaussians, each as precise as its part in the picture asks for.
 
     FILE is any splat file: .ply, .spz, .splat, .sog, .ksplat, .glb, or a .swz. With --size the result has 99 to 100 %
-    of it, never more. Cameras are made up from the scene, and a third of them only measures: the PSNR is against
-    pictures of the source, and a line says what it would cost against photographs.
+    of it, less for some thousand Gaussians (which is told), never more. Cameras are made up from the scene, and a third
+    of them only measures: the PSNR is against pictures of the source, and a line says what it would cost against
+    photographs.
 
-    Of several files each is made to the same target; those that fail do not stop the others.
+    Of several files each is made to the same target; where one cannot be, the others are. A file that is already there
+    is replaced only where --out names it.
     """
     from sw_compress.compressing import compress as make
     from sw_compress.source import default_output
