@@ -31,7 +31,7 @@ def part_options(size: str) -> Sequence[Callable[[shared.F], shared.F]]:
                      help="With cuts: the first P packets.  [default: all]"),
         click.option(size, "size", type=Size(), metavar="SIZE",
                      help="With cuts: the packets that fit, as into 500kB.  [default: all]"),
-        click.option("--partial", is_flag=True, help="With cuts: the packets that are there, of a file that ends early."),
+        click.option("--partial", is_flag=True, help="With cuts: the packets that a file which ends early has."),
     )  # fmt: skip
 
 
