@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.api import MetricSetup, PreparedMetric, psnr, ssim_map
-from sw_metrics.conventions import check_pair
+from sw_metrics.conventions import check_pair, psnr_of
 from sw_metrics.perceptual import VGG_3DGS, Lpips
 
 SMALLEST_EIGENVALUE = 1e-10  # of the largest; smaller ones count as 0, so grey and constant renders are fitted too
@@ -114,8 +114,7 @@ def cc_psnr(render: Tensor, truth: Tensor) -> float:
     squares = torch.zeros((), dtype=torch.float64, device=render.device)
     for x, y in pieces(render, truth):
         squares += torch.addmm(b[:, None], A.T, x).clamp_(0, 1).sub_(y).square_().sum()
-    mse = squares.item() / truth.numel()
-    return math.inf if mse == 0 else -10 * math.log10(mse)
+    return psnr_of(squares.item() / truth.numel())
 
 
 def cc_gain(render: Tensor, truth: Tensor) -> float:

@@ -23,14 +23,18 @@ def check_pair(render: Tensor, truth: Tensor) -> None:
         raise ShapeError(f"image metrics need two [3,H,W] images, got {list(render.shape)} and {list(truth.shape)}")
 
 
+def psnr_of(mse: float) -> float:
+    """PSNR in dB of a mean squared error of values in 0..1; infinite for 0."""
+    return math.inf if mse == 0 else -10 * math.log10(mse)
+
+
 def psnr_unrounded(render: Tensor, truth: Tensor) -> float:
     """Peak signal-to-noise ratio in dB, joint over channels; its entry asks for renders that are not rounded to 8 bit.
 
     Identical images give infinity.
     """
     check_pair(render, truth)
-    mse = (render.double() - truth.double()).square().mean().item()
-    return math.inf if mse == 0 else -10 * math.log10(mse)
+    return psnr_of((render.double() - truth.double()).square().mean().item())
 
 
 def psnr_channel_mean(render: Tensor, truth: Tensor) -> float:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from splatwizard_core.api import UserInputError
-from sw_bench.gsc.scores import PEAK
+from sw_bench.gsc.scores import psnr
 
 PARTS = ("position", "sh0", "sh1", "sh2", "sh3", "rotation", "scaling", "opacity", "metadata")
 COLUMNS = (
@@ -49,8 +48,7 @@ def summary(scores: Sequence[Mapping[str, Any]]) -> Row:
 
 def pooled(mses: Sequence[float]) -> float | None:
     """PSNR in dB of the mean over views of the mean squared error; None where all views are equal."""
-    mean = sum(mses) / len(mses)
-    return None if mean < 1e-12 else 10 * math.log10(PEAK**2 / mean)
+    return psnr(sum(mses) / len(mses))
 
 
 def parts_of(sections: Mapping[str, int], size: int) -> dict[str, int | None]:
