@@ -55,7 +55,7 @@ OURS = (
     "sw_rasterizers.standard", "sw_report.after_run", "sw_view.after_run",
     *(entry.value for entry in entry_points(group="splatwizard") if entry.value.startswith("sw_")),
 )  # fmt: skip
-"""What nearly every run imports: of others, and of ours."""
+"""Modules that nearly every run imports: of others, and of ours."""
 START = subprocess.run
 
 
@@ -78,7 +78,7 @@ def start_python(*arguments: str, **options: Any) -> Any:
 
 
 class Forked:
-    """What `subprocess.Popen` is, of a forked child: its pid, pipes, signals and end.
+    """Counterpart of `subprocess.Popen` for a forked child: its pid, pipes, signals and end.
 
     ended       the end of a pipe that tells its pid, then its status
     """

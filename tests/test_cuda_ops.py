@@ -1,4 +1,4 @@
-"""What only a GPU would show of torch ops on CUDA, read from the sources: headers, definitions, calls."""
+"""Faults of torch ops on CUDA that only a GPU would show, read from the sources: headers, definitions, calls."""
 
 from __future__ import annotations
 

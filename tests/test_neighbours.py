@@ -57,7 +57,7 @@ def test_the_neighbours_are_there(tmp_path):
 
 @pytest.fixture(scope="module")
 def ran(tmp_path_factory: pytest.TempPathFactory) -> subprocess.CompletedProcess[str]:
-    """What is told of the files that can ask what is installed; the others name what they go over."""
+    """Answer about the files that can ask what is installed; the others name what they go over."""
     folders = [ROOT / "tests", *ROOT.glob("splatwizard-*/tests"), *ROOT.glob("plugins/*/tests")]
     tests = [path for folder in folders for path in sorted(folder.rglob("test_*.py"))]
     asking = [str(path) for path in tests if ASKING.search(path.read_text("utf-8"))]

@@ -34,7 +34,7 @@ def container(data: bytes) -> tuple[dict[str, Any], dict[str, bytes]]:
 
 
 def there(header: dict[str, Any], length: int) -> int | None:
-    """How many sections a file with so many bytes of them has; None: all."""
+    """Number of sections that a file with so many bytes of them has; None: all."""
     if "cuts" not in header:
         return None
     sums = np.cumsum([0, *(row[2] for row in header["sections"])]).tolist()

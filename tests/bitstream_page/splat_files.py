@@ -256,7 +256,7 @@ class Pyramid:
 
 
 class Splats:
-    """What is known so far: cells, and [N,22] means, scale levels, multipliers and indices."""
+    """Splats known so far: cells, and [N,22] means, scale levels, multipliers and indices."""
 
     def __init__(self) -> None:
         self.cells: list[Cell] = []

@@ -1,4 +1,4 @@
-"""What goes first, what stays, and that fewer are always a part of more."""
+"""Order in which Gaussians go, those that stay, and that fewer are always a part of more."""
 
 import pytest
 import torch

@@ -304,7 +304,7 @@ def test_every_rate_point_has_the_hash_of_the_python_decoder(wasmtime):
 
 @needs_node
 def test_decimal_numbers_of_a_header_are_rounded_as_in_python(tmp_path):
-    """Where the root cube of wisp stands: means are float64 arithmetic of it, rounded once."""
+    """The root cube of wisp as it stands: means are float64 arithmetic of it, rounded once."""
     plain, paths = (GOLDEN[0].parent / "wisp_none_v1.swz").read_bytes(), []
     random = np.random.default_rng(0)
     for number in range(20):

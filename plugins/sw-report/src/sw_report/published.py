@@ -40,7 +40,7 @@ class Beside:
 
 
 UNPUBLISHED_SPLITS = ("sparse:", "sector:", "block:")
-"""How splits begin that published figures do not stand beside: views are numbered or chosen otherwise there."""
+"""Beginnings of splits that published figures do not stand beside: views are numbered or chosen otherwise there."""
 
 
 def beside(facts: RunFacts, scene: str | None, figures: Sequence[Figure]) -> list[Beside]:

@@ -30,7 +30,7 @@ SCRIPTS = ("data.js", "renderer.js", "camera.js", "main.js")
 POLICY = (
     "default-src 'none'; script-src {script} 'wasm-unsafe-eval'; style-src {style}; worker-src blob:; img-src data:"
 )
-"""What the page may do (CSP): nothing but its own script, style, workers, and an empty icon. It asks no network."""
+"""Policy of the page (CSP): nothing but its own script, style, workers, and an empty icon. It asks no network."""
 MADE_UP = "Nothing was known of the scene's cameras: these were made up around the Gaussians, with -y as up."
 FILE_NAME = "scene.html"
 """Of a run directory; report.html has a link to it."""

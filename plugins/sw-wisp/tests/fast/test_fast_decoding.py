@@ -1,4 +1,4 @@
-"""What the compiled kernels read and predict is what the plain code does, damage included."""
+"""Compiled kernels read and predict as the plain code does, damage included."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -74,7 +74,7 @@ def test_one_stream_of_all_kinds_of_symbols():
 
 
 def told(reader_class, data: bytes, ones: np.ndarray) -> object:
-    """What a reader says of bits: them, or that they are damaged, or too few."""
+    """Answer of a reader to bits: them, or that they are damaged, or too few."""
     try:
         reader = reader_class(data)
         found = reader.bits(ones, None).tolist()
