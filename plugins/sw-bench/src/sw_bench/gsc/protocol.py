@@ -283,7 +283,8 @@ def _row(source: Source, entry: Entry, rate: str | None, plan: Plan, session: Se
     scores = []
     for i, picture in enumerate(drawn.pictures):
         mask = (source.drawn.opacities[i] >= FOREGROUND) | (drawn.opacities[i] >= FOREGROUND)
-        scores.append(dataclasses.asdict(score(source.drawn.pictures[i], picture, mask)))
+        compared = (each.to(session.device) for each in (source.drawn.pictures[i], picture, mask))
+        scores.append(dataclasses.asdict(score(*compared)))
     flags = ["sh-dropped"] if getattr(model, "max_sh_degree", 0) < source.model.active_sh_degree else []
     row |= {
         "splats_decoded": coded.splats, "bytes": coded.bytes, "bits_per_splat": 8 * coded.bytes / source.model.num_rows,
@@ -308,15 +309,15 @@ def _photos(source: Source, drawn: Drawn, session: Session) -> dict[str, Any]:
     if "lpips_vgg_3dgs" in session.plugins.metrics:
         try:
             target: Any = session.plugins.metrics.load("lpips_vgg_3dgs")
-            metrics["lpips_vgg_3dgs"] = target.prepare(MetricSetup(torch.device("cpu"))).compute
+            metrics["lpips_vgg_3dgs"] = target.prepare(MetricSetup(session.device)).compute
         except CapabilityError:
             pass  # its weights are not here: no value
     found: dict[str, Any] = {"protocol": source.ids["photos"]}
-    photographs = source.views.photographs or []
+    truths = [view.image(torch.zeros(3)).to(session.device) for view in source.views.photographs or []]
     for name, compute in metrics.items():
         of = {
-            who: [float(compute(picture / 255, view.image(torch.zeros(3))))
-                  for picture, view in zip(pictures, photographs, strict=True)]
+            who: [float(compute(picture.to(session.device) / 255, truth))
+                  for picture, truth in zip(pictures, truths, strict=True)]
             for who, pictures in (("decoded", drawn.pictures), ("source", source.drawn.pictures))
         }  # fmt: skip
         means = {who: sum(values) / len(values) for who, values in of.items()}

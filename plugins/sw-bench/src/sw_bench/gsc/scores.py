@@ -92,7 +92,8 @@ def to_yuv(rgb: Tensor) -> Tensor:
 
 def to_integer_yuv(rgb: Tensor) -> Tensor:
     """Planes [3,H,W] int64 in 0 .. 255 of uint8 RGB."""
-    planes = (torch.einsum("ij,jhw->ihw", INTEGER_YUV.to(rgb.device), rgb.long()) + (1 << 15)) >> 16
+    exact = torch.einsum("ij,jhw->ihw", INTEGER_YUV.double().to(rgb.device), rgb.double())  # GPUs multiply no integers
+    planes = (exact.long() + (1 << 15)) >> 16
     planes[1:] += 128
     return planes.clamp(0, 255)
 

@@ -1,0 +1,555 @@
+"""Tables about protocols: trained models through codecs, metrics against metrics, splits that hold out a side.
+
+    python benchmarks/protocol_tables.py DATA out/protocols --plan                          # what would be trained
+    python benchmarks/protocol_tables.py DATA out/protocols --gpus 0,1,2,3 --jobs 4         # everything
+    python benchmarks/protocol_tables.py DATA out/protocols --parts gsc,scores,tables --models PLY --device cuda
+    python benchmarks/protocol_tables.py DATA out/protocols --parts tables                  # from what is there
+
+DATA holds the scenes chair, lego, room and fox. Parts, in this order; each does only what is not there yet:
+
+train       3DGS on every scene (Blender scenes on black, which is what the protocol draws on), and 3DGS, HAC++,
+            CAT-3DGS and wisp on room, with every 8th view held out and with a sector of 60 degrees. --steps scales all
+            plans alike, such as --steps 10000 of 3DGS's 30,000; the tables then say so by the runs' steps.
+gsc         `sw bench --protocol mpeg-gsc` of every scene's model (that of --models DIR, NAME.ply, where it is there;
+            else of `train`), one process a codec, seen from the scene's test views: every k-th where there are more
+            than 32.
+scores      `sw eval` of every file of `gsc` on the same views, against the photographs, by all metrics; and of every
+            run under OUT/train and --runs DIR on its own test views.
+tables      OUT/tables.md, gsc.csv, gsc_bd.csv, correlations.csv, splits.csv, distance.html.
+
+Metrics whose package or weights are not there are `not available`, and missing in the tables. --set
+metrics.lpips.weights=DIR says where LPIPS finds its weights. Processes run side by side, --gsc-jobs of gsc and scores
+on the same GPUs; seconds of encoding and decoding are then those of a shared machine.
+
+Correlations are over renders: one view of one decoded file. Every metric is turned so that higher is better. `pooled`
+takes all renders together, where views differ more than codecs; `within` is the mean over views of the correlation over
+the files that show the view, where at least 8 do.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import dataclasses
+import hashlib
+import itertools
+import json
+import math
+import os
+import statistics
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from sw_bench.gsc import TITLE
+from sw_bench.gsc.tables import BD_COLUMNS, COLUMNS, QUALITIES, bd_rows, csv_text
+from sw_report.distance import spearman
+from sw_report.equal_psnr import CurvePoint, at_equal
+from sweep_cells import Cell, add_options, chosen, print_outcomes, run_cells
+
+from splatwizard_core.api import SceneOptions
+from splatwizard_core.tooling import PluginManager, load_plugins, load_scene
+
+SW = [sys.executable, "-m", "splatwizard_core"]
+SCENES = ("chair", "lego", "room", "fox")
+BLACK = "background=black"
+ANCHOR = "gsc-quant"
+MODEL_RATE = "r6"  # of 3dgs: float32, as trained
+SPLIT_SCENE, SECTOR = "room", "sector:60@130"
+SPLIT_METHODS = (("3dgs", MODEL_RATE, 30_000), ("hac-plus", "r4", 30_000), ("cat-3dgs", "r6", 40_000),
+                 ("wisp", "r3", 18_000))  # fmt: skip
+"""Method, its default rate point (3dgs: without a loss), steps of preset paper."""
+STARTS = {"wisp": 30_000}  # steps of the 3DGS scene that it starts from
+FULL_STEPS = 30_000
+MOST_VIEWS = 32
+LEAST_FILES = 8  # that show a view, for a correlation within it
+METRICS = ("psnr", "ssim", "l1", "lpips_vgg_3dgs", "lpips_vgg", "lpips_alex", "cc_psnr", "cc_ssim", "flip", "ms_ssim",
+           "haarpsi", "fsim", "vsi", "gmsd", "cvvdp")  # fmt: skip
+SPLIT_METRICS = ("psnr", "ssim", "lpips_vgg_3dgs")
+AGAINST_SOURCE = ("psnr_rgb", "psnr_yuv", "ssim_yuv", "om_psnr_rgb", "om_ssim_yuv")
+"""Scores of the protocol against renders of the source model, all higher is better."""
+PARTS = ("train", "gsc", "scores", "tables")
+
+Render = tuple[str, str, str]
+"""Scene, view, and file that shows it."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A process: its name, its words after `sw`, and the file whose presence says that it has ended well.
+
+    stdout  where what it prints goes; None: its log alone
+    """
+
+    name: str
+    words: tuple[str, ...]
+    done: Path
+    stdout: Path | None = None
+
+
+# Trainings
+
+
+def training_cells(data: Path, scenes: Sequence[str], steps: int | None) -> list[Cell]:
+    """Every training that the tables need."""
+    cells = [Cell("3dgs", "3dgs", str(data / scene), MODEL_RATE, sets=(*_black(data, scene), *_scaled("3dgs", steps)))
+             for scene in scenes]  # fmt: skip
+    for method, rate, _ in SPLIT_METHODS if SPLIT_SCENE in scenes else ():
+        room, sets = str(data / SPLIT_SCENE), _scaled(method, steps)
+        cells.append(Cell(method, method, room, rate, sets=sets))
+        cells.append(Cell(f"{method}-sector", method, room, rate, sets=(f"split={SECTOR}", *sets)))
+    return list(dict.fromkeys(cells))
+
+
+def _black(data: Path, scene: str) -> tuple[str, ...]:
+    return (BLACK,) if (data / scene / "transforms_test.json").is_file() else ()
+
+
+def _scaled(method: str, steps: int | None) -> tuple[str, ...]:
+    if steps is None:
+        return ()
+    full = next(n for name, _, n in SPLIT_METHODS if name == method)
+    own = ("scale_schedule=true", f"iterations={round(full * steps / FULL_STEPS)}")
+    if method not in STARTS:
+        return own
+    return (*own, "pretrained.scale_schedule=true", f"pretrained.iterations={steps}")
+
+
+def model_of(scene: str, args: argparse.Namespace) -> Path | None:
+    """Find a scene's trained model, .ply: that of --models, else the training's, exported once; None: neither."""
+    if args.models is not None and (given := args.models / f"{scene}.ply").is_file():
+        return given
+    kept = args.out / "models" / f"{scene}.ply"
+    trained = Cell("3dgs", "3dgs", str(args.data / scene), MODEL_RATE).directory(args.out / "train") / "scene.swz"
+    if trained.is_file() and not kept.is_file():
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        subprocess.run([*SW, "export", str(trained), str(kept)], check=True, stdout=sys.stderr)
+    return kept if kept.is_file() else None
+
+
+# Processes
+
+
+def run_jobs(jobs: Sequence[Job], args: argparse.Namespace) -> Counter[str]:
+    """Run processes side by side, those whose result is not there; say what became of each."""
+    gpus = itertools.cycle(args.gpus.split(",")) if args.gpus else None
+    states: Counter[str] = Counter()
+    lock = threading.Lock()
+
+    def work(job: Job) -> None:
+        left = math.inf if args.deadline is None else args.deadline - (time.monotonic() - args.begun)
+        if job.done.is_file():
+            state, seconds = "was there", 0.0
+        elif left <= 0:
+            state, seconds = "unfinished", 0.0
+        else:
+            with lock:
+                gpu = {} if gpus is None else {"CUDA_VISIBLE_DEVICES": next(gpus)}
+            began = time.monotonic()
+            state = _process(job, {"OMP_NUM_THREADS": str(args.threads), **os.environ, **gpu}, left)
+            seconds = time.monotonic() - began
+        with lock:
+            states[state] += 1
+            print(f"{state}: {job.name}" + (f", {seconds:.0f} s" if seconds else ""), flush=True)
+
+    with ThreadPoolExecutor(args.gsc_jobs) as pool:
+        list(pool.map(work, jobs))
+    return states
+
+
+def _process(job: Job, environment: dict[str, str], left: float) -> str:
+    """Run one; its standard output is kept only if it ends well."""
+    log = job.done.with_name(f"{job.done.name}.log")
+    log.parent.mkdir(parents=True, exist_ok=True)
+    printed = log if job.stdout is None else job.stdout.with_name(f"{job.stdout.name}.part")
+    with log.open("wb") as err, open(os.devnull, "wb") if job.stdout is None else printed.open("wb") as out:
+        try:
+            status = subprocess.run(
+                [*SW, *job.words], stdout=out, stderr=err, env=environment, stdin=subprocess.DEVNULL,
+                timeout=None if left == math.inf else left,
+            ).returncode  # fmt: skip
+        except subprocess.TimeoutExpired:
+            return "unfinished"
+    if status != 0:
+        lines = log.read_text(errors="replace").strip().splitlines()
+        return f"failed ({lines[-1][:200] if lines else f'status {status}'})"
+    if job.stdout is not None:
+        printed.replace(job.stdout)
+    return "ran"
+
+
+# Models through codecs
+
+
+def views_of(data: Path, scene: str, plugins: PluginManager) -> tuple[list[str], bool]:
+    """Names of the test views that are drawn, and whether these are fewer than the scene has."""
+    names = [view.name for view in load_scene(str(data / scene), SceneOptions(), plugins).test]
+    every = math.ceil(len(names) / MOST_VIEWS)
+    return names[::every], every > 1
+
+
+def gsc_words(scene: str, model: Path, views: tuple[list[str], bool], args: argparse.Namespace) -> list[str]:
+    """Words of the protocol's command for one scene, without its codecs."""
+    words = ["bench", "--protocol", "mpeg-gsc", str(model), "--cameras", str(args.data / scene)]
+    words += ["--views", ",".join(views[0])] if views[1] else []
+    words += ["--out", str(args.out / "gsc" / scene), "--json"]
+    return words + (["--device", args.device] if args.device else [])
+
+
+def gsc_folder(scene: str, args: argparse.Namespace) -> Path:
+    """Folder that the protocol writes of one scene."""
+    found: Path = args.out / "gsc" / scene / "mpeg-gsc"
+    return found
+
+
+def run_gsc(
+    models: Mapping[str, Path], codecs: Sequence[str], views: Mapping[str, Any], args: argparse.Namespace
+) -> None:
+    """Code every model by every codec, one process each, then collect a scene's rows in one."""
+    jobs = []
+    for (scene, model), codec in itertools.product(models.items(), codecs):
+        alone = ["--method", codec, "-o", f"anchor={codec}"]
+        done = gsc_folder(scene, args) / f"{codec}.done.json"
+        jobs.append(Job(f"gsc {scene} {codec}", (*gsc_words(scene, model, views[scene], args), *alone), done, done))
+    print(f"gsc: {dict(run_jobs(jobs, args))}")
+    together = []
+    for scene, model in models.items():
+        if all((gsc_folder(scene, args) / f"{codec}.done.json").is_file() for codec in codecs):
+            done = gsc_folder(scene, args) / "all.done.json"
+            words = (*gsc_words(scene, model, views[scene], args), "--method", ",".join(codecs))
+            together.append(Job(f"gsc {scene}, all rows", words, done, done))
+    print(f"gsc: {dict(run_jobs(together, args))}")
+
+
+def gsc_rows(scenes: Iterable[str], args: argparse.Namespace) -> list[dict[str, Any]]:
+    """Rows of all scenes whose codecs are coded."""
+    files = (gsc_folder(scene, args) / "all.done.json" for scene in scenes)
+    return [row for file in files if file.is_file() for row in json.loads(file.read_bytes())["rows"]]
+
+
+# Metrics
+
+
+def run_scores(scenes: Iterable[str], views: Mapping[str, Any], args: argparse.Namespace) -> None:
+    """Measure every decoded file, by every metric, on photographs."""
+    base = ["--metrics", ",".join(METRICS), "--no-speed", "--quiet", "--json"]
+    base += ["--device", args.device] if args.device else []
+    base += [word for value in args.set for word in ("--set", value)]
+    jobs = []
+    for scene in scenes:
+        own = ["--scene", str(args.data / scene)]
+        own += [word for value in _black(args.data, scene) for word in ("--set", value)]
+        if views.get(scene, ([], False))[1]:
+            listed = args.out / "scores" / f"{scene}-views.json"
+            listed.parent.mkdir(parents=True, exist_ok=True)
+            listed.write_text(json.dumps({"test": views[scene][0]}))
+            own += ["--set", f"split={listed.resolve()}"]
+        for file in sorted(gsc_folder(scene, args).glob("*/*/r*.swz")):
+            name = f"{file.parent.name} {file.stem}"
+            done = args.out / "scores" / "gsc" / scene / file.parent.name / f"{file.stem}.json"
+            jobs.append(Job(f"scores {scene} {name}", ("eval", str(file), *own, *base), done, done))
+    for folder in [args.out / "train", *args.runs]:
+        for record in sorted(folder.rglob("metrics.json")):
+            file = record.with_name("scene.swz")
+            if file.is_file():
+                name = hashlib.sha256(str(record.parent.resolve()).encode()).hexdigest()[:16]
+                done = args.out / "scores" / "runs" / f"{name}.json"
+                jobs.append(Job(f"scores {record.parent}", ("eval", str(file), *base), done, done))
+    print(f"scores: {dict(run_jobs(jobs, args))}")
+
+
+def renders(
+    rows: Iterable[Mapping[str, Any]], args: argparse.Namespace
+) -> tuple[dict[Render, dict[str, float]], dict[str, str]]:
+    """Values of every render, all turned so that higher is better; and why metrics have none."""
+    found: dict[Render, dict[str, float]] = defaultdict(dict)
+    absent: dict[str, str] = {}
+    scores = args.out / "scores"
+    for file in sorted(scores.rglob("*.json")):
+        record = json.loads(file.read_bytes())
+        if "metrics" not in record:
+            continue
+        for name in METRICS:
+            metric = record["metrics"].get(name)
+            if metric is None:
+                continue
+            if metric["mean"] is None and not any(v is not None for v in metric["per_view"] or []):
+                absent[name] = str(record.get("unknown", {}).get(f"metrics.{name}.mean", "not measured"))
+                continue
+            sign = 1.0 if metric["direction"] == "higher" else -1.0
+            for view, value in zip(record["views"], metric["per_view"], strict=True):
+                if value is not None:
+                    found[record["scene"], view, str(file.relative_to(scores))][name] = sign * value
+    for row in rows:
+        file = f"gsc/{row['sequence']}/{row['codec']}/{row['rate']}.json"
+        for each in row.get("per_view", []):
+            values = {f"gsc_{name}": each[name] for name in AGAINST_SOURCE if each[name] is not None}
+            if (key := (row["sequence"], each["view"], file)) in found:
+                found[key] |= values
+    return dict(found), absent
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """Of two metrics: over n renders together, and the mean within views; None where there is too little."""
+
+    pearson: float | None
+    spearman: float | None
+    within_pearson: float | None
+    within_spearman: float | None
+    n: int
+    views: int
+
+
+def correlate(values: Mapping[Render, Mapping[str, float]], a: str, b: str) -> Correlation:
+    """Correlate two metrics over the renders that have both."""
+    both = [(key, of[a], of[b]) for key, of in values.items() if a in of and b in of]
+    by_view: dict[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
+    for (scene, view, _), x, y in both:
+        by_view[scene, view].append((x, y))
+    inside = [list(zip(*pairs, strict=True)) for pairs in by_view.values() if len(pairs) >= LEAST_FILES]
+    linear = [r for x, y in inside if (r := pearson(x, y)) is not None]
+    ranks = [r for x, y in inside if (r := spearman(x, y)) is not None]
+    x, y = [each[1] for each in both], [each[2] for each in both]
+    few = len(both) < LEAST_FILES
+    return Correlation(
+        None if few else pearson(x, y), None if few else spearman(x, y), statistics.fmean(linear) if linear else None,
+        statistics.fmean(ranks) if ranks else None, len(both), len(ranks),
+    )  # fmt: skip
+
+
+def pearson(a: Sequence[float], b: Sequence[float]) -> float | None:
+    """Linear correlation in -1..1; None where one is constant."""
+    x, y = (np.asarray(each, dtype=np.float64) for each in (a, b))
+    x, y = x - x.mean(), y - y.mean()
+    norm = float(np.sqrt((x @ x) * (y @ y)))
+    return None if norm == 0 else float(x @ y) / norm
+
+
+# Tables
+
+
+def write_tables(scenes: Sequence[str], args: argparse.Namespace) -> None:
+    """Write everything that can be told from what is there."""
+    rows = gsc_rows(scenes, args)
+    bd = bd_rows(rows, ANCHOR) if rows else []
+    (args.out / "gsc.csv").write_text(csv_text(COLUMNS, rows))
+    (args.out / "gsc_bd.csv").write_text(csv_text(BD_COLUMNS, bd))
+    text = [*gsc_section(rows, bd), *correlation_section(rows, args), *split_section(args)]
+    (args.out / "tables.md").write_text("\n".join(text) + "\n")
+    trained = [folder for folder in (args.out / "train", *args.runs) if any(folder.rglob("metrics.json"))]
+    if trained:
+        words = ["report", *map(str, trained), "--distance", str(args.out / "distance.html")]
+        subprocess.run([*SW, *words], check=False, stdout=sys.stderr)
+    print(f"written: {args.out / 'tables.md'}, gsc.csv, gsc_bd.csv, correlations.csv, splits.csv, distance.html")
+
+
+def gsc_section(rows: Sequence[dict[str, Any]], bd: Sequence[dict[str, Any]]) -> list[str]:
+    """BD-rates, and every point of every codec."""
+    if not rows:
+        return []
+    scenes = sorted({row["sequence"] for row in rows})
+    lines = [f"## Models through codecs, {TITLE}", ""]
+    lines += [
+        f"BD-rate against `{ANCHOR}`, %: RGB-PSNR / YUV-PSNR / YUV-SSIM. Codecs with fewer than four points have "
+    ]
+    lines += [f"none: their bytes over those of `{ANCHOR}` at the same pooled PSNR stand in the scenes' tables.", ""]
+    lines += _head(["codec", *scenes, "mean"])
+    for codec in dict.fromkeys(row["codec"] for row in bd):
+        cells = []
+        for scene in (*scenes, "mean"):
+            found = next((row for row in bd if (row["codec"], row["sequence"]) == (codec, scene)), None)
+            cells.append("-" if found is None else " / ".join(_percent(found[f"bd_{name}"]) for name in QUALITIES))
+        lines.append(_line([codec, *cells]))
+    head = ["codec", "rate", "bytes", "bits/splat", "PSNR RGB", "pooled", "PSNR YUV", "SSIM YUV", "photographs: PSNR",
+            "drop", f"x {ANCHOR}", "encode s", "decode s", "remarks"]  # fmt: skip
+    for scene in scenes:
+        of_scene = [row for row in rows if row["sequence"] == scene]
+        first = of_scene[0]
+        views = next((row["views"] for row in of_scene if row["bytes"] is not None), 0)
+        lines += [
+            "",
+            f"### {scene}",
+            "",
+            f"{first['splats_source']:,} splats, {views} views, `{first['protocol']}`",
+            "",
+        ]
+        lines += _head(head)
+        for row in of_scene:
+            if row["bytes"] is None:
+                lines.append(
+                    _line([row["codec"], row["rate"], *["-"] * 11, f"{row['flags']}: {row.get('reason', '')}"])
+                )
+                continue
+            photos = row.get("photos", {}).get("psnr", {})
+            lines.append(_line([
+                row["codec"], row["rate"], f"{row['bytes']:,}", _number(row["bits_per_splat"], 1),
+                _number(row["psnr_rgb"]), _number(row["psnr_rgb_pooled"]), _number(row["psnr_yuv"]),
+                _number(row["ssim_yuv"], 4), _number(photos.get("decoded")), _number(photos.get("drop")),
+                _number(times_anchor(row, of_scene)),
+                _number(row["enc_s"]), _number(row["dec_s"]), row["flags"],
+            ]))  # fmt: skip
+    return [*lines, ""]
+
+
+def times_anchor(row: Mapping[str, Any], of_scene: Iterable[Mapping[str, Any]]) -> float | None:
+    """Bytes of a rate point over those of the anchor's curve at its RGB-PSNR; None where that does not reach it.
+
+    PSNR is pooled, which is defined for all points but exact ones.
+    """
+    key = "psnr_rgb_pooled"
+    curve = [CurvePoint(each["rate"], each["bytes"], each[key]) for each in of_scene
+             if each["codec"] == ANCHOR and each["bytes"] is not None and each[key] is not None]  # fmt: skip
+    if row[key] is None or row["codec"] == ANCHOR:
+        return None
+    ratio = at_equal(curve, row[key], row["bytes"]).ratio
+    return None if ratio is None else 1 / ratio
+
+
+def correlation_section(rows: Sequence[dict[str, Any]], args: argparse.Namespace) -> list[str]:
+    """Metrics against metrics: two squares, Spearman below the diagonal and Pearson above it."""
+    values, absent = renders(rows, args)
+    if not values:
+        return []
+    names = [name for name in (*METRICS, *(f"gsc_{each}" for each in AGAINST_SOURCE))
+             if any(name in of for of in values.values())]  # fmt: skip
+    pairs = {(a, b): correlate(values, a, b) for a, b in itertools.combinations(names, 2)}
+    with (args.out / "correlations.csv").open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["a", "b", *(field.name for field in dataclasses.fields(Correlation))])
+        for (a, b), found in pairs.items():
+            writer.writerow([a, b, *("" if v is None else v for v in dataclasses.astuple(found))])
+    scenes = Counter(scene for scene, _, _ in values)
+    told = ", ".join(f"{scene} {n:,}" for scene, n in sorted(scenes.items()))
+    files = len({file for _, _, file in values})
+    lines = [
+        "## Metrics against metrics",
+        "",
+        f"{len(values):,} renders of {files} file{'s' * (files != 1)}: {told}.",
+        "",
+    ]
+    absences = [f"`{name}` ({why})" for name, why in absent.items() if name not in names]
+    lines += [f"Not available: {'; '.join(absences)}.", ""] if absences else []
+    for title, above, below in (
+        ("All renders together", "pearson", "spearman"),
+        (f"Within views that at least {LEAST_FILES} files show, mean", "within_pearson", "within_spearman"),
+    ):
+        lines += [f"### {title}: Pearson above the diagonal, Spearman below", "", *_head(["", *names])]
+        for i, a in enumerate(names):
+            cells = []
+            for j, b in enumerate(names):
+                found = pairs.get((a, b)) if i < j else pairs.get((b, a))
+                cells.append("" if found is None else _number(getattr(found, above if i < j else below)))
+            lines.append(_line([f"`{a}`", *cells]))
+        lines.append("")
+    return lines
+
+
+def split_section(args: argparse.Namespace) -> list[str]:
+    """Every 8th view against a sector: means over the held-out views, and the fall."""
+    lines, table = [], []
+    for method, rate, _ in SPLIT_METHODS:
+        cells = [Cell(label, method, str(args.data / SPLIT_SCENE), rate) for label in (method, f"{method}-sector")]
+        files = [cell.directory(args.out / "train") / "metrics.json" for cell in cells]
+        if not all(file.is_file() for file in files):
+            continue
+        near, far = (json.loads(file.read_bytes()) for file in files)
+        for name in SPLIT_METRICS:
+            means = [_mean_of(near, name), _mean_of(near, name, set(far["views"])), _mean_of(far, name)]
+            fall = None if None in (means[0], means[2]) else means[0] - means[2]  # type: ignore[operator]
+            table.append([method, rate, name, *means, fall, near["test_views"], far["test_views"],
+                          near["protocol"]["id"], far["protocol"]["id"]])  # fmt: skip
+    heads = ["method", "rate", "metric", "every8", "every8_in_sector", "sector", "fall", "views_every8", "views_sector",
+             "protocol_every8", "protocol_sector"]  # fmt: skip
+    with (args.out / "splits.csv").open("w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows(
+            [heads, *([("" if v is None else v) for v in r] for r in table)]
+        )
+    if not table:
+        return []
+    lines += [f"## Every 8th view against `{SECTOR}` on {SPLIT_SCENE}", ""]
+    lines += [f"`{table[0][9]}` ({table[0][7]} views held out) and `{table[0][10]}` ({table[0][8]} views)", ""]
+    lines += _head(["method", "rate", "metric", "every8", "every8, views inside the sector", "sector", "fall"])
+    lines += [_line([*row[:3], *(_number(v, 2 if row[2] == "psnr" else 4) for v in row[3:7])]) for row in table]
+    return [*lines, ""]
+
+
+def _mean_of(record: Mapping[str, Any], name: str, of: set[str] | None = None) -> float | None:
+    """Mean of a metric over the views of a record, or over those of `of`."""
+    found = record["metrics"].get(name)
+    if found is None:
+        return None
+    pairs = zip(record["views"], found["per_view"], strict=True)
+    values = [value for view, value in pairs if of is None or view in of]
+    return statistics.fmean(values) if values and None not in values else None
+
+
+def _head(cells: Sequence[str]) -> list[str]:
+    return [_line(cells), _line(["---"] * len(cells))]
+
+
+def _line(cells: Iterable[Any]) -> str:
+    return "| " + " | ".join(map(str, cells)) + " |"
+
+
+def _number(value: float | None, digits: int = 2) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{value:+.1f}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path, help="folder of the scenes")
+    parser.add_argument("out", type=Path, help="everything that is made")
+    parser.add_argument("--parts", default=",".join(PARTS), help=f"which of {', '.join(PARTS)} (default: all)")
+    parser.add_argument("--scenes", default=",".join(SCENES), help="default: all four")
+    parser.add_argument(
+        "--models", type=Path, metavar="DIR", help="trained models NAME.ply (default: of the trainings)"
+    )
+    parser.add_argument("--codecs", default="", help="default: all that train nothing")
+    parser.add_argument("--runs", type=Path, action="append", default=[], metavar="DIR", help="further run directories")
+    parser.add_argument("--steps", type=int, help="of 3DGS, all plans scaled alike (default: in full)")
+    parser.add_argument("--gsc-jobs", type=int, default=1, help="processes of gsc and scores at a time (default: 1)")
+    parser.add_argument("--threads", type=int, default=1, help="of each of these (default: 1)")
+    add_options(parser)
+    args = parser.parse_args()
+    args.begun = time.monotonic()
+    args.out.mkdir(parents=True, exist_ok=True)
+    parts, scenes = args.parts.split(","), args.scenes.split(",")
+    if unknown := set(parts) - set(PARTS):
+        parser.error(f"--parts: {', '.join(sorted(unknown))}: give some of {', '.join(PARTS)}")
+    if "train" in parts:
+        cells = chosen(training_cells(args.data, scenes, args.steps), args)
+        outcomes = run_cells(cells, args.out / "train", args)
+        print_outcomes(outcomes, Console(width=160), planned=args.plan)
+    if args.plan:
+        return
+    models = {scene: model for scene in scenes if (model := model_of(scene, args)) is not None}
+    if {"gsc", "scores"} & set(parts):
+        missing = [scene for scene in scenes if scene not in models]
+        print(f"models: {', '.join(models) or 'none'}; missing: {', '.join(missing) or 'none'}")
+        plugins = load_plugins()
+        views = {scene: views_of(args.data, scene, plugins) for scene in models}
+        if "gsc" in parts:
+            free = [entry.name for entry in plugins.methods if entry.declared.get("training_free")]
+            run_gsc(models, args.codecs.split(",") if args.codecs else free, views, args)
+        if "scores" in parts:
+            run_scores(models, views, args)
+    if "tables" in parts:
+        write_tables(scenes, args)
+
+
+if __name__ == "__main__":
+    main()

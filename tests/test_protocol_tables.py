@@ -1,0 +1,84 @@
+"""benchmarks/protocol_tables.py: which trainings it asks for, and that its figures are what they are called."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+from argparse import Namespace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+
+
+@pytest.fixture
+def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    for each in ("sweep_cells", "protocol_tables"):
+        monkeypatch.delitem(sys.modules, each, raising=False)
+    return importlib.import_module("protocol_tables")
+
+
+def test_blender_scenes_are_trained_on_black_and_room_with_both_splits(script, tmp_path):
+    (tmp_path / "lego").mkdir()
+    (tmp_path / "lego" / "transforms_test.json").write_text("{}")
+    cells = script.training_cells(tmp_path, ["lego", "room"], None)
+    told = {(cell.label, cell.rate, Path(cell.scene).name, cell.sets) for cell in cells}
+    assert told == {
+        ("3dgs", "r6", "lego", ("background=black",)),
+        *((method, rate, "room", ()) for method, rate, _ in script.SPLIT_METHODS),
+        *((f"{method}-sector", rate, "room", (f"split={script.SECTOR}",)) for method, rate, _ in script.SPLIT_METHODS),
+    }
+    scaled = next(cell for cell in script.training_cells(tmp_path, ["room"], 3000) if cell.label == "wisp")
+    assert {"iterations=1800", "pretrained.iterations=3000"} <= set(scaled.sets)
+
+
+def test_a_size_beside_the_anchor_is_at_the_same_psnr(script):
+    def point(codec: str, rate: str, size: int, psnr: float | None) -> dict[str, Any]:
+        return {"codec": codec, "rate": rate, "bytes": size, "psnr_rgb_pooled": psnr}
+
+    rows = [point("gsc-quant", "r1", 100, 40.0), point("gsc-quant", "r2", 400, 50.0), point("spz", "r1", 300, 45.0)]
+    assert script.times_anchor(rows[2], rows) == pytest.approx(300 / 200)  # half way in dB, the geometric mean in bytes
+    assert script.times_anchor(rows[0], rows) is None
+    assert script.times_anchor(point("spz", "r2", 300, 51.0), rows) is None
+
+
+def test_metrics_are_turned_so_that_higher_is_better_and_views_are_told_apart(script, tmp_path):
+    """Within each view b falls where a rises, and between views it rises with it."""
+    for i in range(8):
+        metrics = {
+            "psnr": {"direction": "higher", "mean": 1.0, "per_view": [float(i), 100.0 + i]},
+            "l1": {"direction": "lower", "mean": 1.0, "per_view": [float(i), i - 100.0]},
+            "flip": {"direction": "lower", "mean": None, "per_view": [None, None]},
+        }
+        record = {"scene": "room", "views": ["a", "b"], "metrics": metrics,
+                  "unknown": {"metrics.flip.mean": "package-missing"}}  # fmt: skip
+        file = tmp_path / "scores" / "gsc" / "room" / "spz" / f"r{i}.json"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(json.dumps(record))
+    seen = {"view": "a", **dict.fromkeys(script.AGAINST_SOURCE), "psnr_rgb": 7.0}
+    rows = [{"sequence": "room", "codec": "spz", "rate": "r3", "per_view": [seen]}]
+    values, absent = script.renders(rows, Namespace(out=tmp_path))
+    assert absent == {"flip": "package-missing"}
+    assert values["room", "a", "gsc/room/spz/r3.json"] == {"psnr": 3.0, "l1": -3.0, "gsc_psnr_rgb": 7.0}
+    found = script.correlate(values, "psnr", "l1")
+    assert (found.n, found.views) == (16, 2)
+    assert (found.within_pearson, found.within_spearman) == pytest.approx((-1.0, -1.0))
+    assert found.pearson > 0.9
+    assert found.spearman == pytest.approx(0.5, abs=0.01)
+
+
+def test_the_fall_is_from_every_eighth_view_to_the_sector(script, tmp_path):
+    for label, views, values in (("3dgs", ["a", "b"], [30.0, 20.0]), ("3dgs-sector", ["b", "c"], [19.0, 21.0])):
+        folder = script.Cell(label, "3dgs", "room", "r6").directory(tmp_path / "train")
+        folder.mkdir(parents=True)
+        metric = {"mean": sum(values) / 2, "per_view": values}
+        record = {"views": views, "test_views": 2, "metrics": {"psnr": metric}, "protocol": {"id": f"room/{label}"}}
+        (folder / "metrics.json").write_text(json.dumps(record))
+    lines = script.split_section(Namespace(out=tmp_path, data=Path()))
+    assert "| 3dgs | r6 | psnr | 25.00 | 20.00 | 20.00 | 5.00 |" in lines
+    assert "3dgs,r6,psnr,25.0,20.0,20.0,5.0,2,2,room/3dgs,room/3dgs-sector" in (tmp_path / "splits.csv").read_text()
