@@ -119,6 +119,7 @@ def hac_anchors(settings: Mapping[str, Any]) -> SplatModel:
 SMALL_HAC = {
     "voxel_size": 0.01, "num_offsets": 3, "feature_dim": 5, "hidden": 4, "grid.hidden": 6, "grid.features": 2,
     "grid.space": [6, 18], "grid.planes": [10, 40], "grid.log2_space": 7, "grid.log2_planes": 8,
+    "codec.settings.weights": "float32",
 }  # fmt: skip
 
 
@@ -314,7 +315,7 @@ CASES: dict[str, Case] = {
     **dict.fromkeys(("hac_exact_v1", "hac_exact_v2"), ("hac", "r4", SMALL_HAC, lambda: hac_anchors(SMALL_HAC))),
     **dict.fromkeys(
         ("hac_half_v1", "hac_half_v2"),
-        ("hac", "r1", {**SMALL_HAC, "codec.weights": "float16"}, lambda: hac_anchors(SMALL_HAC)),
+        ("hac", "r1", {**SMALL_HAC, "codec.settings.weights": "float16"}, lambda: hac_anchors(SMALL_HAC)),
     ),
     "hac_plus_v1": ("hac-plus", "r4", SMALL_HAC_PLUS, lambda: hac_plus_anchors(SMALL_HAC_PLUS)),
     "hac_plus_tiny_v1": ("hac-plus", "r1", TINY_HAC_PLUS, lambda: hac_plus_anchors(TINY_HAC_PLUS)),

@@ -91,7 +91,7 @@ def recorded(model, mode="exact"):
     """Blocks that a walk over the model hands to its encoder, and the geometry."""
     model = copy.deepcopy(model)
     model.fold_units()
-    round_networks(model.networks(), "float32")
+    round_networks(model.networks(), "float16")
     geometry, rows = kept_voxels(model)
     further = codec.mixtures(model.channel, mode, PLUGINS)
     recorder = Recorder(model, rows, codec.sections(model.channel), mode, PLUGINS, further)

@@ -228,7 +228,7 @@ def test_a_damaged_section_is_answered(name, place, value, how):
         ("feature_dim", 257), ("grid_hidden", 17), ("grid_space", [4096] * 32), ("base_steps", [1, 0, 1]),
         ("mode", "fast"), ("mode", "float"), ("channel", "huge"), ("channel", None), ("channel", "tiny"),
         ("channel", "none"), ("slices", [8]), ("slices", [4, 5]), ("slices", [-8, 16]), ("slices", "all"),
-        ("channel_hidden", 7), ("channel_hidden", 513), ("weights", "float16"),
+        ("channel_hidden", 7), ("channel_hidden", 513), ("weights", "float32"),
     ],
 )  # fmt: skip
 def test_header_values_of_a_stranger_are_refused(key, value):

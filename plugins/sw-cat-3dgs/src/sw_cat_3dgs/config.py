@@ -111,10 +111,12 @@ class ContextLearningRates(Params):
 class FileSettings(Params):
     """Settings of the file."""
 
+    DEFAULTS: ClassVar[int] = 1
+
     mode: Literal["exact", "float"] = Field(
         "exact", description="exact: integers, decodes anywhere; float: only where networks give the same floats"
     )
-    weights: Literal["float32", "float16"] = Field("float32", description="how weights of networks are stored")
+    weights: Literal["float32", "float16"] = Field("float16", description="how weights of networks are stored")
 
 
 class Codec(OwnCodec):

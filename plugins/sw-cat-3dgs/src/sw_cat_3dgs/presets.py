@@ -69,7 +69,6 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "context.start": "statistics",
         "rate_term.scale": 0.25,
         "rate_term.triplane_sample": 0.125,
-        "codec.settings.weights": "float16",
     },
 }
 

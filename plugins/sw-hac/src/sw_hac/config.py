@@ -93,10 +93,12 @@ class Steps(Params):
 class FileSettings(Params):
     """Settings of the file."""
 
+    DEFAULTS: ClassVar[int] = 1
+
     mode: Literal["exact", "float"] = Field(
         "exact", description="exact: decodes on any machine; float: as published, decodes on this one"
     )
-    weights: Literal["float32", "float16"] = Field("float32", description="type of the networks' weights")
+    weights: Literal["float32", "float16"] = Field("float16", description="type of the networks' weights")
 
 
 class HACParams(CodedAnchorParams):

@@ -41,7 +41,6 @@ QUICK: Mapping[str, Any] = {
     "lr.grid_final": 0.001,
     "lr.mlp_grid_init": 0.01,
     "lr.mlp_grid_final": 0.0005,
-    "codec.settings.weights": "float16",
 }
 """Preset `quick` as far as HAC++ shares it: the plan scaled down for a CPU and the demo scene.
 
