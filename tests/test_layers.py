@@ -61,7 +61,7 @@ LIBRARIES = {
 EXTENDS = {"sw_hac_plus": "sw_hac"}
 """Method -> the method that it builds on, and so imports."""
 ABOUT_RUNS = {
-    "sw_bench", "sw_compress", "sw_datasets", "sw_doctor", "sw_geometry", "sw_kit", "sw_metrics", "sw_report",
+    "sw_bench", "sw_compress", "sw_datasets", "sw_doctor", "sw_geometry", "sw_kit", "sw_lod", "sw_metrics", "sw_report",
     "sw_view",
 }  # fmt: skip
 """Packages that may use `tooling` besides `api`."""

@@ -182,7 +182,8 @@ def test_closeness_is_the_mahalanobis_distance():
 def model_of_points(points: torch.Tensor, scale: float = 0.1, alpha: float = 0.5) -> GaussianModel:
     n = len(points)
     return GaussianModel.from_tensors(
-        points, torch.randn(n, 1, 3, generator=torch.Generator().manual_seed(7)), torch.zeros(n, 3, 3), torch.logit(torch.full((n,), alpha)),
+        points, torch.randn(n, 1, 3, generator=torch.Generator().manual_seed(7)), torch.zeros(n, 3, 3),
+        torch.logit(torch.full((n,), alpha)),
         torch.full((n, 3), math.log(scale)), torch.tensor([1.0, 0, 0, 0]).expand(n, 4),
     )  # fmt: skip
 

@@ -11,8 +11,8 @@ import math
 from typing import Literal, NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from splatwizard_core.api import GaussianModel, ShapeError
 
@@ -53,7 +53,7 @@ def splats_of(model: GaussianModel) -> Splats:
         raise ShapeError("surfels cannot be merged: an average of flat ones has a thickness")
     bands = (model.active_sh_degree + 1) ** 2 - 1
     sh = torch.cat([model.sh_dc, model.sh_rest[:, :bands]], dim=1).detach()
-    return Splats(model.means.detach(), model.scales.detach(), F.normalize(model.quats.detach(), dim=1),
+    return Splats(model.means.detach(), model.scales.detach(), normalize(model.quats.detach(), dim=1),
                   model.opacities.detach(), sh)  # fmt: skip
 
 
@@ -110,7 +110,7 @@ def merge_groups(groups: Splats, *, rule: Rule = "ink", widen: bool = False) -> 
     shares = torch.where(total > 0, masses / total.clamp_min(1e-300), 1 / alphas.shape[1])
     center = (shares[..., None] * offsets).sum(dim=1, keepdim=True)
     offsets = offsets - center
-    members = covariances(scales, F.normalize(groups.quats, dim=-1))
+    members = covariances(scales, normalize(groups.quats, dim=-1))
     spread = offsets[..., :, None] * offsets[..., None, :]
     found = (shares[..., None, None] * (members + spread)).sum(dim=1)
     values, axes = torch.linalg.eigh((found + found.mT) / 2)
@@ -173,5 +173,5 @@ def quaternions(rotations: Tensor) -> Tensor:
         c, e, f, 1 - xx - yy + zz,
     ], dim=1).view(-1, 4, 4)  # row k is 4 q_k q  # fmt: skip
     largest = candidates.diagonal(dim1=1, dim2=2).argmax(dim=1)
-    found = F.normalize(candidates.gather(1, largest[:, None, None].expand(-1, 1, 4))[:, 0], dim=1)
+    found = normalize(candidates.gather(1, largest[:, None, None].expand(-1, 1, 4))[:, 0], dim=1)
     return torch.where(found[:, :1] < 0, -found, found)

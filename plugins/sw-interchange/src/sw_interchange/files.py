@@ -15,13 +15,12 @@ import numpy as np
 
 from splatwizard_core.api import BitstreamError, LeftOut, SceneError, UserInputError, replacing
 from sw_interchange.frames import axes_of, in_frame
-from sw_interchange.known_formats import Format, detect, format_named, format_of_suffix
+from sw_interchange.known_formats import INDEX, META, Format, detect, format_named, format_of_suffix
 from sw_interchange.scene import GaussianScene, Limits, ReadReport, WriteReport, cleaned
 from sw_interchange.source import Source
 
 NO_LIMITS = Limits()
 FOLDER = "sog-folder"
-META = "meta.json"
 KEEPS_SURFELS = ("ply", "sog", FOLDER)
 
 
@@ -33,6 +32,7 @@ def read(
     frame: str | None = "RDF",
     strict: bool = False,
     spz_frame: str = "RUB",
+    level: int = 0,
     undo_dataparser: str | os.PathLike[str] | None = None,
 ) -> GaussianScene:
     """Read a file; `scene.report` says what was found and mended.
@@ -41,14 +41,15 @@ def read(
     frame           axes of the result; None: as stored
     strict          raise where rows hold what is no number, instead of dropping them
     spz_frame       axes of .spz files that do not say: "RUB" as the format's text has it, "raw" for RDF
+    level           of a scene of several levels of detail, 0 the finest
     undo_dataparser dataparser_transforms.json of nerfstudio: back to the axes and size of the photographs
 
     Raises BitstreamError if the file is damaged, SceneError if it cannot be read or holds no Gaussians, UserInputError.
     """
     where = Path(path)
     if where.is_dir():
-        where = where / META
-    source = _checked(Source.open(where, spz_frame=spz_frame))
+        where = where / (INDEX if (where / INDEX).exists() else META)
+    source = _checked(Source.open(where, spz_frame=spz_frame, level=level))
     scene = _decoded(source, format, limits, frame, strict)
     if undo_dataparser is None:
         return scene

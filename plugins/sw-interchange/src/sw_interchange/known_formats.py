@@ -13,6 +13,9 @@ from splatwizard_core.api import BitstreamError, UserInputError
 from sw_interchange.source import Source
 from sw_interchange.spz_packing import inflate
 
+META = "meta.json"
+INDEX = "lod-meta.json"
+"""Name of the index of a streamed SOG."""
 MAX_META = 1 << 20
 """Bytes of a meta.json."""
 
@@ -64,6 +67,8 @@ _FORMATS = (
            writer="sog_writer:write_sog", options="sog_writer:SogOptions"),
     Format("sog-folder", ".json", "the same images in a folder, beside their meta.json", 3, reader="sog:read_sog",
            writer="sog_writer:write_sog", options="sog_writer:SogOptions"),
+    Format("streamed-sog", INDEX, "levels of detail in SOG folders, read by level (PlayCanvas)", 3,
+           reader="streamed_sog:read_streamed_sog"),
     Format("ksplat", ".ksplat", "buckets of quantised Gaussians (mkkellogg)", 2, reader="ksplat:read_ksplat"),
     Format("gltf", ".glb", "binary glTF with KHR_gaussian_splatting, float32", 3, frame="LUF",
            reader="gltf:read_gltf", writer="gltf_writer:write_gltf", options="gltf_writer:GltfOptions"),
@@ -108,6 +113,8 @@ def detect(source: Source) -> Format:
     if head[:4] == b"glTF":
         return format_named("gltf")
     if head.lstrip()[:1] == b"{":
+        if name.endswith(INDEX) or b'"lodLevels"' in head or b'"filenames"' in head:
+            return format_named("streamed-sog")
         return format_named("gltf" if b'"asset"' in head and b'"means"' not in head else "sog")
     for suffix, found in ((".splat", "splat"), (".ksplat", "ksplat")):
         if name.endswith(suffix):

@@ -78,6 +78,7 @@ import_spz, export_spz, export_spz4 = _importer("spz"), _exporter("spz"), _expor
 import_sog, export_sog = _importer("sog"), _exporter("sog")
 import_sog_folder, export_sog_folder = _importer("sog"), _exporter("sog-folder")
 import_compressed_ply, export_compressed_ply = _importer("compressed-ply"), _exporter("compressed-ply")
+import_streamed_sog = _importer("streamed-sog")
 import_ksplat = _importer("ksplat")
 import_gltf, export_gltf = _importer("gltf"), _exporter("gltf")
 import_checkpoint = _importer("checkpoint")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -200,6 +200,17 @@ class GaussianScene:
     def in_frame(self, frame: str) -> GaussianScene:
         """The same scene in other axes, such as "RUB"; see `frames`."""
         return in_frame(self, frame)
+
+
+def joined(scenes: Sequence[GaussianScene]) -> GaussianScene:
+    """One scene of several in the same frame; SH bands that one lacks are zero. The rest is that of the first."""
+    if len(scenes) == 1:
+        return scenes[0]
+    k = max(scene.sh_rest.shape[1] for scene in scenes)
+    rest = [np.pad(scene.sh_rest, ((0, 0), (0, k - scene.sh_rest.shape[1]), (0, 0))) for scene in scenes]
+    names = ("means", "log_scales", "quats", "opacity_logits", "sh_dc")
+    columns = {name: np.concatenate([getattr(scene, name) for scene in scenes]) for name in names}
+    return replace(scenes[0], **columns, sh_rest=np.concatenate(rest))
 
 
 def sigmoid(logits: Array) -> Array:

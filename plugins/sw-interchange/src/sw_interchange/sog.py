@@ -91,7 +91,7 @@ class _Bundle:
         if not isinstance(found, dict):
             raise BitstreamError(f"{self.name}: its meta.json is no description of a scene")
         if "lodLevels" in found:
-            raise BitstreamError(f"{self.name}: a streamed scene of several levels: read one of its chunks")
+            raise BitstreamError(f"{self.name}: an index of several levels: read it as 'streamed-sog'")
         return found
 
     # Values of the description, each held to its kind.

@@ -43,6 +43,7 @@ class SogOptions(Options):
 def write_sog(scene: GaussianScene, options: SogOptions, report: WriteReport) -> list[bytes]:
     """Encode a scene in RDF as a bundle. Raises UserInputError for one that no image of the format holds."""
     buffer = io.BytesIO()
+    scene = scene.select(morton_order(scene.means))
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
         for name, content in sog_files(scene, options, report).items():
             # A date of its own for every run would make equal scenes differ.
@@ -51,13 +52,12 @@ def write_sog(scene: GaussianScene, options: SogOptions, report: WriteReport) ->
 
 
 def sog_files(scene: GaussianScene, options: SogOptions, report: WriteReport) -> dict[str, bytes]:
-    """Name -> content of the files, meta.json last. Raises as `write_sog`."""
+    """Name -> content of the files, meta.json last, the rows as they are. Raises as `write_sog`."""
     n = scene.num_gaussians
     width = 4 * math.ceil(math.sqrt(n) / 4)
     height = 4 * math.ceil(n / width / 4)
     if width > LARGEST_SIDE:
         raise UserInputError(f"{n:,} Gaussians are too many for .sog: its images have up to {LARGEST_SIDE} columns")
-    scene = scene.select(morton_order(scene.means))
     files: dict[str, bytes] = {}
 
     def image(name: str, *columns: Pixels) -> str:

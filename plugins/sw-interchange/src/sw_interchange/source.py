@@ -16,19 +16,20 @@ class Source:
     data    all of them; of a file a view of the pages that the system holds
     path    where they lie, if they lie anywhere: files beside it may belong to it
     name    for messages
-    options of the reader, such as `spz_frame`
+    spz_frame, level    options of the reader: see `files.read`
     """
 
     data: bytes | memoryview
     name: str
     path: Path | None = None
     spz_frame: str = "RUB"
+    level: int = 0
 
     @classmethod
-    def open(cls, path: str | os.PathLike[str], *, spz_frame: str = "RUB") -> Source:
+    def open(cls, path: str | os.PathLike[str], *, spz_frame: str = "RUB", level: int = 0) -> Source:
         """Map a file. Raises SceneError if it cannot be read."""
         where = Path(path)
-        return cls(memory_map(where), where.name, where, spz_frame)
+        return cls(memory_map(where), where.name, where, spz_frame, level)
 
     def head(self, count: int) -> bytes:
         """The first bytes, at most `count`."""

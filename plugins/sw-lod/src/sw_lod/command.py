@@ -1,0 +1,54 @@
+"""`sw lod`: a scene in pieces and levels, so that a viewer loads what it shows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from splatwizard_core.tooling import EXISTING, debug_option, device_option, json_option, options, print_facts, say
+
+
+class Count(click.ParamType):  # type: ignore[type-arg]  # generic only in new releases of click
+    """A number of Gaussians, also as 64k or 1M."""
+
+    name = "count"
+
+    def convert(self, value: str | int, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        text = str(value).strip()
+        times = {"k": 1024, "M": 1 << 20}.get(text[-1:], 1)
+        digits = text[:-1] if times > 1 else text
+        if not digits.isascii() or not digits.isdigit() or len(digits) > 9:
+            self.fail(f"{text!r} is no number of Gaussians, such as 64k", param, ctx)
+        return int(digits) * times
+
+
+@click.command(short_help="a scene in pieces and levels, for streaming")
+@click.argument("file", metavar="FILE", type=EXISTING)
+@options(
+    click.option("--out", metavar="PATH", required=True, type=click.Path(),
+                 help="DIR/lod-meta.json: streamed SOG, for SuperSplat's viewer and the PlayCanvas engine."),
+    click.option("--levels", type=click.IntRange(1, 64), metavar="N",
+                 help="How many, each half of the one before.  [default: down to a 64th, at least 20,000]"),
+    click.option("--chunk", type=Count(), default="64k", show_default=True, metavar="N",
+                 help="Gaussians of a piece at most, all its levels together."),
+    device_option, json_option, debug_option,
+)  # fmt: skip
+def lod(file: Path, out: str, levels: int | None, chunk: int, device: str | None, as_json: bool) -> None:
+    """Write FILE in levels of detail and in pieces: a viewer loads what it shows, as finely as it needs.
+
+    FILE is any splat file: .ply, .spz, .splat, .sog, .ksplat, .glb, or a .swz of explicit Gaussians. Each level has
+    half as many Gaussians as the finer one: neighbours merge where it shows least. The pieces of a level lie in folders
+    beside the index, each a SOG of its own.
+    """
+    from sw_lod.writing import write_lod
+
+    record = write_lod(file, out, levels=levels, chunk=chunk, device=device or "auto", say=say)
+    counts = ", ".join(f"{count:,}" for count in record["counts"])
+    told = (
+        f"{record['out']}: {len(record['counts'])} levels ({counts} Gaussians) in {record['leaves']} pieces, "
+        f"{record['units']} units of {record['bytes']:,} bytes"
+    )
+    for line in record["warnings"]:
+        say(line)
+    print_facts(record, as_json, told)

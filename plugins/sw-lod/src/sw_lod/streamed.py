@@ -1,0 +1,107 @@
+"""Writing streamed SOG: an index of places and levels, and units that a viewer asks for one by one."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from sw_interchange.known_formats import META
+from sw_interchange.scene import GaussianScene, WriteReport
+from sw_interchange.sog_writer import SogOptions, sog_files
+
+from splatwizard_core.tooling import write_atomic
+from sw_lod.tree import Node, Rows, build_tree, leaves_of
+
+DIGITS = 7
+"""Of the numbers of a box; float32 has no more."""
+
+
+def write_streamed(
+    levels: Sequence[GaussianScene], index: Path, *, chunk: int, iterations: int = 10,
+    say: Callable[[str], None] = lambda _: None,
+) -> dict[str, Any]:  # fmt: skip
+    """Write the index and its units beside it, the index last: it names files that are there.
+
+    levels      the same scene ever coarser, in RDF; the finest first
+    chunk       Gaussians of a leaf at most, all levels together; a unit is closed when it holds more
+    iterations  of the k-means that finds each unit's palette of SH
+
+    Returns facts: `counts` by level, `units`, `leaves`, `bytes`, `warnings`. Raises UserInputError for a scene that
+    SOG cannot hold.
+    """
+    tree = build_tree(levels, chunk)
+    leaves = leaves_of(tree)
+    lods: list[dict[str, dict[str, int]]] = [{} for _ in leaves]
+    names, total, warnings = [], 0, set()
+    # An index of an earlier scene would name units that are being replaced.
+    index.unlink(missing_ok=True)
+    for level, scene in enumerate(levels):
+        for number, members in enumerate(_units(leaves, level, chunk)):
+            folder = f"{level}_{number}"
+            offset, file = 0, len(names)
+            for leaf in members:
+                count = len(leaves[leaf].rows[level])
+                lods[leaf][str(level)] = {"file": file, "offset": offset, "count": count}
+                offset += count
+            rows: Rows = np.concatenate([leaves[leaf].rows[level] for leaf in members])
+            report = WriteReport("sog")
+            files = sog_files(scene.select(rows), SogOptions(iterations=iterations), report)
+            total += _write_unit(index.parent / folder, files)
+            warnings.update(report.notices())
+            names.append(f"{folder}/{META}")
+            say(f"{folder}: {len(rows):,} Gaussians")
+    text = json.dumps(_description(tree, levels, names, lods), separators=(",", ":"), allow_nan=False)
+    write_atomic(index, text.encode())
+    return {
+        "counts": [scene.num_gaussians for scene in levels], "units": len(names), "leaves": len(leaves),
+        "bytes": total + len(text), "warnings": sorted(warnings),
+    }  # fmt: skip
+
+
+def _units(leaves: list[Node], level: int, chunk: int) -> Iterator[list[int]]:
+    """Numbers of the leaves of each unit of a level: neighbours, until there are more Gaussians than `chunk`."""
+    members: list[int] = []
+    held = 0
+    for number, leaf in enumerate(leaves):
+        count = len(leaf.rows[level])
+        if not count:
+            continue
+        members.append(number)
+        held += count
+        if held > chunk:
+            yield members
+            members, held = [], 0
+    if members:
+        yield members
+
+
+def _write_unit(folder: Path, files: dict[str, bytes]) -> int:
+    folder.mkdir(exist_ok=True)
+    for name, content in files.items():
+        write_atomic(folder / name, content)
+    return sum(map(len, files.values()))
+
+
+def _description(
+    tree: Node, levels: Sequence[GaussianScene], names: list[str], lods: list[dict[str, dict[str, int]]]
+) -> dict[str, Any]:
+    counts = [scene.num_gaussians for scene in levels]
+    remaining = iter(lods)
+
+    def told(node: Node) -> dict[str, Any]:
+        bound = {"min": _rounded(node.low), "max": _rounded(node.high)}
+        if node.children is None:
+            return {"bound": bound, "lods": next(remaining)}
+        return {"bound": bound, "children": [told(child) for child in node.children]}
+
+    return {
+        "version": 1, "asset": {"generator": "Splatwizard"}, "count": sum(counts), "counts": counts,
+        "lodLevels": len(levels), "filenames": names, "tree": told(tree),
+    }  # fmt: skip
+
+
+def _rounded(point: Any) -> list[float]:
+    return [float(f"{x:.{DIGITS}g}") for x in point]

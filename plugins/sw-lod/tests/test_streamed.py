@@ -1,0 +1,106 @@
+"""Streamed SOG that is written here holds every Gaussian of every level once, in boxes that hold it."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from scipy.spatial import cKDTree
+from sw_interchange import from_gaussians, read
+from sw_interchange.streamed_sog import parse_index
+from sw_lod import write_lod
+from sw_lod.command import lod
+from sw_lod.tree import build_tree, leaves_of
+
+from splatwizard_core.api import UserInputError
+
+
+@pytest.fixture(scope="module")
+def written(model, tmp_path_factory) -> tuple[Path, dict]:
+    index = tmp_path_factory.mktemp("lod") / "scene" / "lod-meta.json"
+    return index, write_lod(model, index, levels=3, chunk=400, device="cpu")
+
+
+def test_each_level_has_half_of_the_one_before(written):
+    index, record = written
+    found = parse_index(index.read_bytes(), "index")
+    assert record["counts"] == found.counts == [1200, 600, 300]
+    assert [read(index, level=level).num_gaussians for level in range(3)] == found.counts
+
+
+def test_the_finest_level_is_the_scene(written, model):
+    scene, found = from_gaussians(model), read(written[0])
+    far, rows = cKDTree(found.means).query(scene.means)
+    assert len(set(rows.tolist())) == scene.num_gaussians
+    assert far.max() < 1e-3  # steps of 16 bits over a scene of 8 units
+    assert np.abs(found.sh_dc[rows] - scene.sh_dc).max() < 0.1  # a codebook of 256 for each unit
+
+
+def test_a_place_names_rows_whose_gaussians_lie_in_its_box(written):
+    index, _ = written
+    found = parse_index(index.read_bytes(), "index")
+    units = {name: read(index.parent / name) for name in found.units}
+    for leaf in found.leaves:
+        assert sum(rows.count for rows in leaf.levels.values()) <= 400
+        for rows in leaf.levels.values():
+            means = units[found.units[rows.file]].means[rows.offset : rows.offset + rows.count]
+            assert (means >= np.array(leaf.low) - 1e-3).all()
+            assert (means <= np.array(leaf.high) + 1e-3).all()
+
+
+def test_the_box_of_a_parent_holds_those_of_its_children(written):
+    pending = [json.loads(written[0].read_text())["tree"]]
+    while pending:
+        node = pending.pop()
+        for child in node.get("children", []):
+            assert np.all(np.array(child["bound"]["min"]) >= node["bound"]["min"])
+            assert np.all(np.array(child["bound"]["max"]) <= node["bound"]["max"])
+            pending.append(child)
+
+
+def test_a_unit_holds_one_level_and_is_closed_when_it_is_full(written):
+    index, record = written
+    found = parse_index(index.read_bytes(), "index")
+    for number in range(len(found.units)):
+        used = [(level, rows) for leaf in found.leaves for level, rows in leaf.levels.items() if rows.file == number]
+        assert len({level for level, _ in used}) == 1
+        assert sum(rows.count for _, rows in used[:-1]) <= 400
+    assert record["units"] == len(found.units) > 3
+
+
+def test_the_same_scene_gives_the_same_files(written, model, tmp_path):
+    write_lod(model, tmp_path / "lod-meta.json", levels=3, chunk=400, device="cpu")
+    for file in sorted(written[0].parent.rglob("*.*")):
+        assert (tmp_path / file.relative_to(written[0].parent)).read_bytes() == file.read_bytes()
+
+
+def test_gaussians_at_one_place_are_one_leaf(model):
+    scene = from_gaussians(model)
+    scene.means[:] = 1
+    assert len(leaves_of(build_tree([scene], 300))) == 1
+
+
+def test_what_cannot_be_seen_is_left_out(model, tmp_path):
+    import torch
+
+    raw = {name: getattr(model, name).detach().clone() for name in model.RAW}
+    raw["opacity_logits"][:7] = -20
+    raw["means"][7] = torch.nan
+    record = write_lod(type(model)(**raw), tmp_path / "lod-meta.json", levels=1, device="cpu")
+    assert record["counts"] == [1192]
+
+
+@pytest.mark.parametrize(("out", "told"), [("scene.json", "lod-meta.json"), ("scene.sog", "lod-meta.json")])
+def test_other_names_are_refused(model, tmp_path, out, told):
+    with pytest.raises(UserInputError, match=told):
+        write_lod(model, tmp_path / out)
+
+
+@pytest.mark.parametrize("chunk", ["0", "-1", "8 mb", "1e9", "99999999999k", "10"])
+def test_a_size_of_pieces_that_makes_no_sense_is_refused(tmp_path, chunk):
+    file = tmp_path / "scene.ply"
+    file.write_bytes(b"ply\n")
+    found = CliRunner().invoke(lod, [str(file), "--out", str(tmp_path / "lod-meta.json"), "--chunk", chunk])
+    assert found.exit_code != 0
+    assert not (tmp_path / "lod-meta.json").exists()
