@@ -87,7 +87,8 @@ def prices(a: Columns, b: Columns) -> Tensor:
     field = field - 2 * at * mt * _dot(a.colors, colors) * _product(a.volumes, volumes, a.six + six, other * d)
     field = field - 2 * bt * mt * _dot(b.colors, colors) * _product(b.volumes, volumes, b.six + six, share * d)
     apart = ((a.colors - b.colors) ** 2).sum(dim=0) + ((a.rest - b.rest) ** 2).sum(dim=0) / (4 * math.pi)
-    return (2 * math.pi) ** 1.5 * field.clamp_min(0) + COLOR_PRICE * apart
+    found: Tensor = (2 * math.pi) ** 1.5 * field.clamp_min(0) + COLOR_PRICE * apart
+    return found
 
 
 def _ink_opacity(a: Columns, b: Columns, d: Tensor, six: Tensor) -> Tensor:
@@ -108,7 +109,7 @@ def _ink_opacity(a: Columns, b: Columns, d: Tensor, six: Tensor) -> Tensor:
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    return (a * b).sum(dim=0)
 
 
 def _outer(d: Tensor) -> Tensor:
@@ -126,13 +127,15 @@ def _adjugate(six: Tensor) -> Tensor:
 
 def _det(six: Tensor) -> Tensor:
     xx, xy, xz, yy, yz, zz = six
-    return xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
+    found: Tensor = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
+    return found
 
 
 def _quadratic_of(six: Tensor, v: Tensor) -> Tensor:
     x, y, z = v
     xx, xy, xz, yy, yz, zz = six
-    return x * (xx * x + 2 * (xy * y + xz * z)) + y * (yy * y + 2 * yz * z) + zz * z * z
+    found: Tensor = x * (xx * x + 2 * (xy * y + xz * z)) + y * (yy * y + 2 * yz * z) + zz * z * z
+    return found
 
 
 def _quadratic(six: Tensor, d: Tensor, det: Tensor) -> Tensor:
@@ -156,7 +159,8 @@ def _least_eigenvalue(six: Tensor) -> Tensor:
     p = ((x * x + y * y + z * z + 2 * off) / 6).sqrt()
     det = x * (y * z - yz * yz) - xy * (xy * z - yz * xz) + xz * (xy * yz - y * xz)
     r = (det / (2 * p * p * p).clamp_min(SMALLEST)).clamp(-1, 1)
-    return (middle + 2 * p * torch.cos(torch.acos(r) / 3 + 2 * math.pi / 3)).clamp_min(0)
+    found: Tensor = middle + 2 * p * torch.cos(torch.acos(r) / 3 + 2 * math.pi / 3)
+    return found.clamp_min(0)
 
 
 def _null_vector(six: Tensor, value: Tensor) -> Tensor:

@@ -81,9 +81,10 @@ def covariances(scales: Tensor, quats: Tensor) -> Tensor:
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ], dim=-1).unflatten(-1, (3, 3))  # fmt: skip
+    ], dim=-1).view(*w.shape, 3, 3)  # fmt: skip
     axes = rotation * scales[..., None, :]
-    return axes @ axes.mT
+    found: Tensor = axes @ axes.mT
+    return found
 
 
 @torch.no_grad()

@@ -84,8 +84,8 @@ def _unit(splats: Splats) -> float:
     """Size of the scene: the radius that holds half of what is visible."""
     sizes = splats.scales.double().sort(dim=1, descending=True).values
     areas = splats.opacities.double() * sizes[:, 0] * sizes[:, 1]
-    points, areas, sizes = (values.cpu().numpy() for values in (splats.means.double(), areas, sizes[:, 0]))
-    return extent_of(points, areas, sizes).r50
+    points, weights, widths = (values.cpu().numpy() for values in (splats.means.double(), areas, sizes[:, 0]))
+    return extent_of(points, weights, widths).r50
 
 
 def _curve(points: Tensor, wave: int) -> Tensor:

@@ -202,7 +202,7 @@ def _leaves(tree: dict[str, Any], levels: int, units: int) -> Iterator[Leaf]:
 
 
 def _bound(value: Any) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    corners = [value.get("min"), value.get("max")] if isinstance(value, dict) else []
+    corners: list[Any] = [value.get("min"), value.get("max")] if isinstance(value, dict) else []
     good = len(corners) == 2 and all(isinstance(c, list) and len(c) == 3 for c in corners)
     if not good or not all(type(x) in (int, float) and abs(x) < 1e38 for corner in corners for x in corner):
         raise _RefusedError("the box of a node is no two points of three numbers")
@@ -219,7 +219,7 @@ def _level(key: str, levels: int) -> int:
 
 
 def _rows(value: Any, units: int) -> Rows:
-    numbers = [value.get(key) for key in ("file", "offset", "count")] if isinstance(value, dict) else []
+    numbers: list[Any] = [value.get(key) for key in ("file", "offset", "count")] if isinstance(value, dict) else []
     if len(numbers) != 3 or not all(type(n) is int and 0 <= n < 1 << 32 for n in numbers):
         raise _RefusedError("a level of a leaf has no file, offset and count")
     rows = Rows(*numbers)

@@ -35,7 +35,9 @@ def write_streamed(
     tree = build_tree(levels, chunk)
     leaves = leaves_of(tree)
     lods: list[dict[str, dict[str, int]]] = [{} for _ in leaves]
-    names, total, warnings = [], 0, set()
+    names: list[str] = []
+    warnings: set[str] = set()
+    total = 0
     # An index of an earlier scene would name units that are being replaced.
     index.unlink(missing_ok=True)
     for level, scene in enumerate(levels):

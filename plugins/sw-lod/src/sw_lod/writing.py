@@ -15,7 +15,14 @@ from sw_interchange.bridge import from_gaussians
 from sw_interchange.known_formats import INDEX
 
 from splatwizard_core.api import GaussianModel, SceneError, UserInputError
-from splatwizard_core.tooling import choose_device, existing_file, load_plugins, open_model, read_gaussians
+from splatwizard_core.tooling import (
+    OUTPUT_FOLDER,
+    choose_device,
+    existing_file,
+    load_plugins,
+    open_model,
+    read_gaussians,
+)
 from sw_lod.streamed import write_streamed
 
 CHUNK = 65_536
@@ -51,6 +58,7 @@ def write_lod(
         scenes.append(from_gaussians(model))
         say(f"level {level}: {count:,} Gaussians")
     merged = time.perf_counter()
+    target.parent.mkdir(parents=True, exist_ok=True)
     facts = write_streamed(scenes, target, chunk=chunk, say=say)
     ended = time.perf_counter()
     seconds = {"merge": round(merged - started, 3), "write": round(ended - merged, 3)}
@@ -64,10 +72,7 @@ def _target(out: str | os.PathLike[str]) -> Path:
         raise UserInputError(f"{target}: levels are written as DIR/{INDEX}: name that file, in a folder of its own")
     if target.is_dir():
         raise UserInputError(f"{target} is a folder: give the name of a file in it")
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserInputError(f"cannot write {target}: {error.strerror}") from None
+    OUTPUT_FOLDER.check(target.parent)
     return target
 
 
