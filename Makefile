@@ -54,7 +54,8 @@ test-interchange: $(VENV)/.ready-dev
 	test -d build/oracle/venv || $(PYTHON) -m venv build/oracle/venv
 	build/oracle/venv/bin/pip install -q gsply==0.4.6
 	SPLAT_TRANSFORM=build/oracle/node_modules/.bin/splat-transform GSPLY_PYTHON=build/oracle/venv/bin/python \
-		$(BIN)/python -m pytest -m '' plugins/sw-interchange/tests/test_other_programs.py plugins/sw-lod/tests/test_splat_transform.py \
+		$(BIN)/python -m pytest -m '' plugins/sw-interchange/tests/test_other_programs.py plugins/sw-interchange/tests/test_lcc.py \
+		plugins/sw-lod/tests/test_splat_transform.py \
 		$(PYTEST_ARGS)
 
 test-wheels: $(VENV)/.ready-dev

@@ -35,6 +35,8 @@ def register_importers(registry: Registry) -> None:
                  summary="the same as images beside their meta.json")  # fmt: skip
     registry.add("streamed-sog", "sw_interchange.registered:import_streamed_sog", suffix="lod-meta.json",
                  summary="the finest level of a streamed SOG of PlayCanvas")  # fmt: skip
+    registry.add("lcc", "sw_interchange.registered:import_lcc", suffix=".lcc",
+                 summary="the finest level of an .lcc of XGRIDS")  # fmt: skip
     registry.add("ksplat", "sw_interchange.registered:import_ksplat", suffix=".ksplat",
                  summary=".ksplat of GaussianSplats3D, levels 0 to 2")  # fmt: skip
     registry.add("gltf", "sw_interchange.registered:import_gltf", suffix=".glb",
