@@ -50,13 +50,14 @@ test-browser: $(VENV)/.ready-dev
 
 # Needs node 20 or newer; what is installed stays below build/.
 test-interchange: $(VENV)/.ready-dev
-	npm install --silent --prefix build/oracle @playcanvas/splat-transform@3.7.0
+	npm install --silent --prefix build/oracle @playcanvas/splat-transform@3.7.0 @sparkjsdev/spark@2.2.0 three@0.180.0
 	test -d build/oracle/venv || $(PYTHON) -m venv build/oracle/venv
 	build/oracle/venv/bin/pip install -q gsply==0.4.6
 	SPLAT_TRANSFORM=build/oracle/node_modules/.bin/splat-transform GSPLY_PYTHON=build/oracle/venv/bin/python \
-		$(BIN)/python -m pytest -m '' plugins/sw-interchange/tests/test_other_programs.py plugins/sw-interchange/tests/test_lcc.py \
-		plugins/sw-lod/tests/test_splat_transform.py \
-		$(PYTEST_ARGS)
+	SPARK_MODULES=build/oracle/node_modules \
+		$(BIN)/python -m pytest -m '' plugins/sw-interchange/tests/test_other_programs.py \
+		plugins/sw-interchange/tests/test_lcc.py plugins/sw-interchange/tests/test_spark.py \
+		plugins/sw-lod/tests/test_splat_transform.py $(PYTEST_ARGS)
 
 test-wheels: $(VENV)/.ready-dev
 	$(PIP) install -q ziglang

@@ -70,6 +70,7 @@ _FORMATS = (
     Format("streamed-sog", INDEX, "levels of detail in SOG folders, read by level (PlayCanvas)", 3,
            reader="streamed_sog:read_streamed_sog"),
     Format("lcc", ".lcc", "rows by cell and level, 32 bytes and 64 of SH each (XGRIDS)", 3, reader="lcc:read_lcc"),
+    Format("rad", ".rad", "a tree of Gaussians in chunks, the coarsest first (Spark)", 3, reader="rad:read_rad"),
     Format("ksplat", ".ksplat", "buckets of quantised Gaussians (mkkellogg)", 2, reader="ksplat:read_ksplat"),
     Format("gltf", ".glb", "binary glTF with KHR_gaussian_splatting, float32", 3, frame="LUF",
            reader="gltf:read_gltf", writer="gltf_writer:write_gltf", options="gltf_writer:GltfOptions"),
@@ -113,6 +114,8 @@ def detect(source: Source) -> Format:
         return format_named(_kind_of_archive(source))
     if head[:4] == b"glTF":
         return format_named("gltf")
+    if head[:4] == b"RAD0":
+        return format_named("rad")
     if name.endswith(".lcc"):
         return format_named("lcc")
     if head.lstrip()[:1] == b"{":

@@ -37,6 +37,8 @@ def register_importers(registry: Registry) -> None:
                  summary="the finest level of a streamed SOG of PlayCanvas")  # fmt: skip
     registry.add("lcc", "sw_interchange.registered:import_lcc", suffix=".lcc",
                  summary="the finest level of an .lcc of XGRIDS")  # fmt: skip
+    registry.add("rad", "sw_interchange.registered:import_rad", suffix=".rad",
+                 summary="the finest Gaussians of a .rad of Spark")  # fmt: skip
     registry.add("ksplat", "sw_interchange.registered:import_ksplat", suffix=".ksplat",
                  summary=".ksplat of GaussianSplats3D, levels 0 to 2")  # fmt: skip
     registry.add("gltf", "sw_interchange.registered:import_gltf", suffix=".glb",
