@@ -157,6 +157,9 @@ FOR_ONE = {
     "sw_gaussians.baking": "makes explicit Gaussians of a model for sw-view, and knows the parts of GaussianModel",
     "sw_gaussians.bake_refining": "trains on pictures that sw-view gives it, with the stage of sw-gaussians",
     "sw_gaussians.ring_cameras": "two more recipes beside `made_up_cameras`, by which the MPEG protocol draws",
+    "sw_gaussians.merging": "moments of Gaussians, for any simplification: levels of detail are the first",
+    "sw_gaussians.merge_costs": "the price of a merge, beside it",
+    "sw_gaussians.simplifying": "a model with fewer Gaussians, beside the pruners, for compression too",
 }
 """Module of a library that one family alone reaches -> why it is there; at most ten."""
 
