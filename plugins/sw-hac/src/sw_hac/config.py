@@ -94,7 +94,6 @@ class FileSettings(Params):
     """Settings of the file."""
 
     DEFAULTS: ClassVar[int] = 1
-
     mode: Literal["exact", "float"] = Field(
         "exact", description="exact: decodes on any machine; float: as published, decodes on this one"
     )
