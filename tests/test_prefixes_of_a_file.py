@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from splatwizard_core.cli.main import main
+from splatwizard_core.tooling import parse_size
 
 GOLDEN = Path(__file__).parent / "golden"
 PACKETS = GOLDEN / "3dgs_packets_v1.swz"
@@ -108,6 +109,15 @@ def test_a_file_without_cuts_is_not_cut(capsys, tmp_path):
     assert told(capsys, "decode", plain, "--partial", "--repeats", 0)["packets"] == 0
 
 
-@pytest.mark.parametrize("size", ["", "-1", "1e9", "5 pounds", "1kib", "kB"])
+@pytest.mark.parametrize(
+    ("size", "meant"),
+    [("500", 500), (" 5 kB", 5000), ("1.5mb", 1_500_000), (".5GB", 500_000_000), ("2k", 2000), ("8KiB", 8192),
+     ("8MiB", 8 << 20), ("1gib", 1 << 30), ("12b", 12), (7, 7)],
+)  # fmt: skip
+def test_a_size_is_decimal_or_binary(size, meant):
+    assert parse_size(size) == meant
+
+
+@pytest.mark.parametrize("size", ["", "-1", "1e9", "5 pounds", "kB", "0.1B", "2000000GB", "9" * 99])
 def test_what_is_no_size_is_refused(capsys, size):
     assert "is no size" in refused(capsys, "decode", PACKETS, "--bytes", size)

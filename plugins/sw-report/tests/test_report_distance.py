@@ -59,6 +59,14 @@ def test_records_without_distances_have_no_such_part(make_run, tmp_path, capsys)
     assert "no record says how far its test views lie" in capsys.readouterr().err
 
 
+def test_too_few_views_are_the_reason_where_they_are(make_run, tmp_path, capsys):
+    make_run(change=placed([0.1, 0.2, 0.3], [30.0, 29.0, 28.0]))
+    assert main(["report", str(tmp_path), "--distance", str(tmp_path / "sheet.html")]) == 2
+    assert "no run has 4 test views whose distance and PSNR are known, a group each; the most is 3" in (
+        capsys.readouterr().err
+    )
+
+
 def test_the_sheet_has_a_chart_and_a_table_of_each_scene_and_split(make_run, tmp_path):
     distances = [0.1 * i for i in range(8)]
     for scene in ("room", "chair"):

@@ -13,6 +13,7 @@ from splatwizard_core.base.progress import Bar as Bar
 from splatwizard_core.base.progress import duration as duration
 from splatwizard_core.base.strict_json import json_reason as json_reason
 from splatwizard_core.base.toml_file import read_toml as read_toml
+from splatwizard_core.base.values import parse_size as parse_size
 from splatwizard_core.cli.complete import COMPLETION_VARIABLE as COMPLETION_VARIABLE
 from splatwizard_core.cli.complete import SCENE as SCENE
 from splatwizard_core.cli.complete import name_of as name_of
@@ -39,6 +40,7 @@ from splatwizard_core.cli.options import set_option as set_option
 from splatwizard_core.cli.paths import EXISTING as EXISTING
 from splatwizard_core.cli.paths import OUTPUT_FILE as OUTPUT_FILE
 from splatwizard_core.cli.paths import OUTPUT_FOLDER as OUTPUT_FOLDER
+from splatwizard_core.cli.paths import OUTPUT_PAGE as OUTPUT_PAGE
 from splatwizard_core.cli.paths import existing_file as existing_file
 from splatwizard_core.cli.setup import Choices as Choices
 from splatwizard_core.cli.setup import open_session as open_session

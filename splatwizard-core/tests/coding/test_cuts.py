@@ -113,6 +113,22 @@ def test_damage_before_a_cut_is_found_and_behind_it_is_not_looked_at():
         ContainerReader(bytes(data))
 
 
+def test_partial_stops_before_damage_and_says_so(caplog):
+    good, (first, second, _) = progressive(), ends()
+    for at, packets in ((-1, 2), (first, 1)):
+        data = bytearray(good)
+        data[at] ^= 1
+        with caplog.at_level("WARNING"):
+            part = ContainerReader(bytes(data), f"{packets}.swz", Prefix(partial=True))
+        assert part.summary() == ContainerReader(good[: (first, second)[packets - 1]]).summary()
+        assert f"CRC-32 does not match: the file is damaged; the {packets} of 3 packets before it are" in caplog.text
+        with pytest.raises(BitstreamError, match="CRC-32"):
+            ContainerReader(bytes(data), prefix=Prefix(3, partial=True))
+    data[first - 1] ^= 1
+    with pytest.raises(BitstreamError, match="section 'base': its CRC-32"):
+        ContainerReader(bytes(data), prefix=Prefix(partial=True))
+
+
 GOOD = [[1, 8, None], [3, 11, 20.5], [5, 18, 30]]
 
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import click
 
 from splatwizard_core.tooling import (
-    OUTPUT_FILE,
     OUTPUT_FOLDER,
+    OUTPUT_PAGE,
     debug_option,
     name_of,
     options,
@@ -33,7 +33,7 @@ def _columns(_context: click.Context, _parameter: click.Parameter, incomplete: s
 @click.command(short_help="tables, curves, BD-rates, one HTML page")
 @click.argument("folders", metavar="DIR...", nargs=-1, required=True, type=click.Path())
 @options(
-    click.option("--html", metavar="FILE", type=OUTPUT_FILE,
+    click.option("--html", metavar="FILE", type=OUTPUT_PAGE,
                  help="Write one self-contained page there.  [default: none]"),
     click.option("--survey", metavar="FOLDER", type=OUTPUT_FOLDER,
                  help="Write FOLDER/<dataset>/<scene>/<method>.csv, as the survey of 3DGS compression asks.  "
@@ -41,7 +41,7 @@ def _columns(_context: click.Context, _parameter: click.Parameter, incomplete: s
     click.option("--plots", metavar="FOLDER", type=OUTPUT_FOLDER,
                  help="Write FOLDER/rd-<scene>.svg and .pdf, rate-distortion curves for papers; needs matplotlib.  "
                  "[default: none]"),
-    click.option("--distance", "sheet", metavar="FILE", type=OUTPUT_FILE,
+    click.option("--distance", "sheet", metavar="FILE", type=OUTPUT_PAGE,
                  help="Write one page about how far from the training views models hold.  [default: none]"),
     click.option("--csv", "form", flag_value="csv",
                  help="Print CSV: the survey's columns after what tells runs apart."),

@@ -171,7 +171,7 @@ def distance_parts(runs: Sequence[Run], style_of: dict[str, int]) -> list[Part]:
 def sheet_section(runs: Sequence[Run], style_of: dict[str, int]) -> Section:
     """PSNR of all scenes and protocols against distance, side by side, and a table of each.
 
-    Raises UserInputError if no record says how far its test views lie from the training views.
+    Raises UserInputError, with the reason, if there is nothing to draw.
     """
     places: dict[tuple[str, str], list[Run]] = {}
     for run in with_distances(runs):
@@ -187,9 +187,12 @@ def sheet_section(runs: Sequence[Run], style_of: dict[str, int]) -> Section:
             legend.update({name: key for key, name in drawn.legend})
             tables.append(Part(f"{place[0]}, protocol {place[1]}", table=distance_table(group)))
     if not figures:
+        views = max((len(_known(run, DISTANCE)) for run in runs), default=0)
         raise UserInputError(
-            "no record says how far its test views lie from the training views: make one by `sw run` with sw-metrics, "
-            "which measures path_combined"
+            f"no run has {GROUPS} test views whose distance and PSNR are known, a group each; the most is {views}"
+            if views
+            else "no record says how far its test views lie from the training views: make one by `sw run` with "
+            "sw-metrics, which measures path_combined"
         )
     charts = Charts(figures, [(key, name) for name, key in legend.items()])
     return Section("distance", "PSNR by distance from the training views", [Part(charts=charts), *tables], EXPLAINED)

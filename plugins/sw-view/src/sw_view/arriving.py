@@ -84,8 +84,9 @@ class Arriving:
         if self._data[:4] != MAGIC[:size] or size > MOST:
             raise BitstreamError(f"{self.url}: this is no .swz file of at most {MOST:,} bytes")
         self._ends = self._ends or self._first_end()
-        if self.packets < len(self._ends) and size >= self._ends[self.packets]:
-            self._take(ContainerReader(bytes(self._data), self.file.name, Prefix(partial=True)))
+        while self.packets < len(self._ends) and size >= self._ends[self.packets]:
+            whole = Prefix(sum(end <= size for end in self._ends), partial=True)
+            self._take(ContainerReader(bytes(self._data), self.file.name, whole))
 
     def _first_end(self) -> list[int]:
         """Place of the first cut, by the opening that has arrived (docs/bitstream.md); nothing if it does not tell."""

@@ -12,7 +12,7 @@ import click
 
 from splatwizard_core.tooling import (
     EXISTING,
-    OUTPUT_FILE,
+    OUTPUT_PAGE,
     Choices,
     config_option,
     debug_option,
@@ -60,7 +60,7 @@ class PathOrAddress(type(EXISTING)):  # type: ignore[misc]  # the core's type of
                  help="Port of the server; another one if it is taken."),
     click.option("--host", default=LOCAL, show_default=True, metavar="ADDRESS", shell_complete=_addresses,
                  help="Address that the server listens on; 0.0.0.0: all of this machine's, open to its network."),
-    click.option("--html", "page", type=OUTPUT_FILE, metavar="FILE",
+    click.option("--html", "page", type=OUTPUT_PAGE, metavar="FILE",
                  help="Write one HTML file that shows the model offline, or two side by side.  [default: none, but a "
                  "server]"),
     scene_option, images_option, config_option, set_option, device_option, json_option, debug_option,

@@ -5,12 +5,17 @@ from __future__ import annotations
 import contextlib
 import enum
 import json
+import re
 import types
 import typing
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Literal, Union
 
 from pydantic import BaseModel, TypeAdapter
+
+from splatwizard_core.errors import UserInputError
+
+_SIZE = re.compile(r"\s*(\d{1,15}(?:\.\d{0,9})?|\.\d{1,9})\s*(?:([kmg])(i?))?b?\s*", re.IGNORECASE | re.ASCII)
 
 
 def members(annotation: Any) -> list[Any]:
@@ -45,6 +50,17 @@ def parse_text(annotation: Any, text: str) -> Any:
         except ValueError as error:
             problem = problem or error
     raise problem or ValueError("expected none")
+
+
+def parse_size(text: str | int) -> int:
+    """Return bytes, 1 to 2^50, of `500000`, `500kB` (10^3), `8MB`, `1.5GB` or `8MiB` (2^20). Raises UserInputError."""
+    found = _SIZE.fullmatch(str(text))
+    size = float(found[1]) * (1024 if found[3] else 1000) ** " kmg".index((found[2] or " ").lower()) if found else 0
+    if not 1 <= size <= 1 << 50:
+        raise UserInputError(
+            f"'{text!s:.80}' is no size: give bytes, 1 to 2^50, or a number with kB, MB, GB, KiB, MiB or GiB, as 8MB"
+        )
+    return int(size)
 
 
 def _whole_number(text: str) -> int:

@@ -46,6 +46,14 @@ def output_file(path: str | Path) -> Path:
     return target
 
 
+def output_page(path: str | Path) -> Path:
+    """An output file with the name of a page, by which a browser knows it."""
+    target = output_file(path)
+    if Path(path).suffix.lower() not in (".html", ".htm"):
+        raise UserInputError(f"cannot write {path}: this is a page, give a name that ends in .html")
+    return target
+
+
 def output_folder(path: str | Path) -> Path:
     """A folder that files can be written to, there or not; whoever writes the first file makes it."""
     target = Path(path)
@@ -80,4 +88,4 @@ class CheckedPath(click.ParamType):  # type: ignore[type-arg]  # generic only in
 
 
 EXISTING, INPUT_FILE, OUTPUT_FILE = CheckedPath(existing), CheckedPath(existing_file), CheckedPath(output_file)
-OUTPUT_FOLDER = CheckedPath(output_folder, "dir")
+OUTPUT_PAGE, OUTPUT_FOLDER = CheckedPath(output_page), CheckedPath(output_folder, "dir")

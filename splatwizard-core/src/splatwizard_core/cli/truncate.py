@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -12,26 +11,25 @@ from splatwizard_core.cli import options as shared
 from splatwizard_core.cli.paths import INPUT_FILE, OUTPUT_FILE
 
 
-class Size(click.ParamType):  # type: ignore[type-arg]  # generic only in new releases of click
-    """A number of bytes: 500000, 500kB or 0.5MB; the units are decimal."""
+def _size(context: click.Context, _parameter: click.Parameter, given: str | None) -> int | None:
+    from splatwizard_core.base.values import parse_size
 
-    name = "size"
-
-    def convert(self, value: str | int, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        found = re.fullmatch(r"(\d{1,15}(?:\.\d{1,9})?) ?(|[kMG])B?", str(value))
-        if found is None:
-            self.fail(f"{value!r} is no size, such as 500kB, 1.5MB or 500000", param, ctx)
-        return int(float(found[1]) * {"": 1, "k": 1e3, "M": 1e6, "G": 1e9}[found[2]])
+    if given is None:
+        return None
+    if context.params.get("packets") is not None:
+        raise click.UsageError("--packets and a size each choose a cut: give one of them")
+    return parse_size(given)
 
 
 def part_options(size: str) -> Sequence[Callable[[shared.F], shared.F]]:
     """Return the options for a part of a file with cuts, parameters packets, size and partial; `size` is called so."""
     return (
-        click.option("--packets", type=click.IntRange(min=1), metavar="P",
+        click.option("--packets", type=click.IntRange(min=1), metavar="P", is_eager=True,
                      help="With cuts: the first P packets.  [default: all]"),
-        click.option(size, "size", type=Size(), metavar="SIZE",
-                     help="With cuts: the packets that fit, as into 500kB.  [default: all]"),
-        click.option("--partial", is_flag=True, help="With cuts: the packets that a file which ends early has."),
+        click.option(size, "size", metavar="SIZE", callback=_size,
+                     help="With cuts: the packets that fit, as into 500kB or 2MiB.  [default: all]"),
+        click.option("--partial", is_flag=True,
+                     help="With cuts: the packets before the place where a file ends early or is damaged."),
     )  # fmt: skip
 
 

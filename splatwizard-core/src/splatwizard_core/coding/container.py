@@ -22,6 +22,7 @@ import numpy.typing as npt
 
 from splatwizard_core.base.files import write_atomic
 from splatwizard_core.base.strict_json import dump_strict, load_strict
+from splatwizard_core.base.warned import warn_once
 from splatwizard_core.coding.array_section import pack_array, unpack_array
 from splatwizard_core.coding.cuts import WHOLE, Cut, Prefix, chosen_cut, parse_cuts
 from splatwizard_core.coding.limits import beyond_limit, decoded_limit
@@ -255,7 +256,8 @@ class ContainerReader:
         )
 
     def _split(self, header: dict[str, Any], file: BinaryIO, prefix: Prefix) -> dict[str, bytes]:
-        rows, available = self._rows(header["sections"]), self.size - file.tell()
+        rows, start = self._rows(header["sections"]), file.tell()
+        available = self.size - start
         self.cuts: list[Cut] = []
         self.packets = 0
         if "cuts" in header:
@@ -267,18 +269,24 @@ class ContainerReader:
             raise UserInputError(f"{self.name}: it declares no cuts, it is decoded whole or not at all")
         if self.cuts and available <= self.cuts[-1].bytes:
             try:
-                self.packets = chosen_cut(self.cuts, available, file.tell(), prefix, self.name)
+                self.packets = chosen_cut(self.cuts, available, start, prefix, self.name)
             except ValueError as error:
                 raise self._damage(str(error)) from error
             sections, available, _ = self.cuts[self.packets - 1]
-            rows, self.size = rows[:sections], file.tell() + available
+            rows, self.size = rows[:sections], start + available
         payload: dict[str, bytes] = {}
         for key, length, crc in rows:
             part = file.read(min(length, available))  # never more than there is
             if len(part) != length:
                 raise self._damage(f"is {len(part):,} bytes, header says {length:,}: the file is truncated", key)
             if zlib.crc32(part) != crc:
-                raise self._damage("its CRC-32 does not match: the file is damaged", key)
+                damage = self._damage("its CRC-32 does not match: the file is damaged", key)
+                whole = [cut for cut in self.cuts if cut.sections <= len(payload)]
+                if not prefix.partial or prefix.packets is not None or not whole:
+                    raise damage
+                warn_once(f"{damage}; the {len(whole)} of {len(self.cuts)} packets before it are read")
+                self.packets, self.size = len(whole), start + whole[-1].bytes
+                return dict(list(payload.items())[: whole[-1].sections])
             payload[key] = part
             available -= length
         if available:

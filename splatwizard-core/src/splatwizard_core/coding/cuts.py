@@ -31,7 +31,7 @@ class Prefix(NamedTuple):
 
     packets     so many packets
     bytes       the longest cut of at most so many bytes, header included
-    partial     of a file that does not end at a cut, as of a broken download, the longest cut that is whole
+    partial     of a file that ends at no cut or is damaged, as of a broken download, the longest cut that is whole
     """
 
     packets: int | None = None
