@@ -61,8 +61,16 @@ SW_OPERATION(answer, sum) {
 """
 
 
+@pytest.fixture(scope="module")
+def objects(tmp_path_factory):
+    return tmp_path_factory.mktemp("objects")
+
+
 @pytest.fixture
-def module(package, monkeypatch):
+def module(package, objects, tmp_path):
+    """The module; its objects are kept from test to test, so that each links a library and the first alone compiles."""
+    (tmp_path / "cache" / "native").mkdir(parents=True)
+    (tmp_path / "cache" / "native" / "objects").symlink_to(objects)
     package.write("face.h", HEADER)
     package.write("answer.cpp", SOURCE)
     package.write("offered.py", "")
