@@ -30,6 +30,9 @@ demo: $(VENV)/.ready
 	$(BIN)/sw run --method chimerags --scene demo --out $(DEMO_OUT)
 	$(BIN)/sw report $(DEMO_OUT)/demo
 
+# Hundreds of processes import our packages: without their bytecode each would compile them anew.
+test coverage: export PYTHONDONTWRITEBYTECODE =
+
 test: $(VENV)/.ready-dev
 	$(BIN)/python -m pytest -n $(TEST_JOBS) $(TEST_DIST) $(PYTEST_ARGS)
 
