@@ -109,7 +109,7 @@ $(VENV)/bin/python:
 # hatchling first: with it at hand no package needs a build environment of its own.
 $(VENV)/.ready: $(VENV)/bin/python constraints.txt $(PROJECTS)
 	$(PIP) install -q -c constraints.txt hatchling editables
-	$(PIP) install -q -c constraints.txt --no-build-isolation $(addprefix -e ,$(PACKAGES))
+	$(BIN)/python tools/install_packages.py --constraint constraints.txt $(PACKAGES)
 	@touch $@
 
 $(VENV)/.ready-dev: $(VENV)/.ready requirements-dev.txt

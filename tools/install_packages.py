@@ -1,0 +1,55 @@
+"""Install packages of this workspace into the running environment as `pip install --no-build-isolation -e` does.
+
+    tools/install_packages.py --constraint constraints.txt splatwizard-core plugins/sw-3dgs ...
+
+pip starts Python three times for each of them; here one process makes the editable wheels, pip unpacks them and brings
+what they depend on, and all cores compile bytecode: a third of the time. Needs hatchling and editables.
+"""
+
+from __future__ import annotations
+
+import argparse
+import compileall
+import importlib.metadata
+import json
+import os
+import subprocess
+import sys
+import sysconfig
+import tempfile
+from pathlib import Path
+
+from hatchling.build import build_editable
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--constraint", required=True, type=Path)
+    parser.add_argument("folders", nargs="+", type=Path)
+    given = parser.parse_args()
+    constraint, folders = str(given.constraint.resolve()), [folder.resolve() for folder in given.folders]
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "install", "-q", "--no-compile", "-c", constraint]
+    with tempfile.TemporaryDirectory() as made:
+        wheels = [Path(made) / editable_wheel(folder, made) for folder in folders]
+        subprocess.run([*pip, "--no-deps", "--force-reinstall", *map(str, wheels)], check=True)
+    names = [wheel.name.partition("-")[0] for wheel in wheels]
+    for name, folder in zip(names, folders, strict=True):
+        note_origin(name, folder)
+    subprocess.run([*pip, *names], check=True)
+    compileall.compile_dir(sysconfig.get_path("purelib"), quiet=2, workers=0)
+
+
+def editable_wheel(folder: Path, made: str) -> str:
+    os.chdir(folder)
+    return build_editable(made)
+
+
+def note_origin(name: str, folder: Path) -> None:
+    """Note that a distribution is the folder itself, which `pip list`, `pip uninstall` and our advice tell."""
+    (noted,) = (file for file in importlib.metadata.files(name) or () if file.name == "direct_url.json")
+    origin = {"dir_info": {"editable": True}, "url": folder.as_uri()}
+    Path(str(noted.locate())).write_text(json.dumps(origin), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
