@@ -139,7 +139,7 @@ def test_a_hidden_gaussian_costs_nothing_and_one_that_a_single_view_shows_costs_
 
 @compiled
 def test_sensitivities_are_the_sums_of_squared_derivatives():
-    g, camera, rasterizer = splats(20), camera_at(0.0, 0.0, -3.0), StandardRasterizer()
+    g, camera, rasterizer = splats(20), camera_at(0.0, 0.0, -3.0, size=12), StandardRasterizer()
     leaves = {name: getattr(g, name).clone().requires_grad_() for name in ("means", "opacities", "scales")}
     drawn = replace(g, **leaves)
     exact = {name: torch.zeros_like(leaf) for name, leaf in leaves.items()}
@@ -149,12 +149,12 @@ def test_sensitivities_are_the_sums_of_squared_derivatives():
             exact, torch.autograd.grad(value, [*leaves.values()], retain_graph=True), strict=True
         ):
             exact[name] += gradient.square()
-    found = sensitivities(lambda _: drawn, leaves, [camera], rasterizer, stream(0, "signs"), BACKGROUND, draws=400)
+    found = sensitivities(lambda _: drawn, leaves, [camera], rasterizer, stream(0, "signs"), BACKGROUND, draws=200)
     assert all(leaf.grad is None for leaf in leaves.values())
     for name, expected in exact.items():
         ratio = found[name].double()[expected > 0] / expected[expected > 0]
-        assert float(ratio.mean()) == pytest.approx(1, abs=0.03), name  # the rms of one entry is 7 %
-        assert bool(((ratio - 1).abs() < 0.3).all()), name
+        assert float(ratio.mean()) == pytest.approx(1, abs=0.04), name  # the rms of one entry is 10 %
+        assert bool(((ratio - 1).abs() < 0.4).all()), name
 
 
 def test_other_models_are_refused(views):
