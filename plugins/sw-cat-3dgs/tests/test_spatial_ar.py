@@ -94,7 +94,7 @@ networks = [SpatialAr(torch.Generator().manual_seed(seed)).exact() for seed in r
 one = PlaneCoder().decode(Path(sys.argv[2]).read_bytes(), PlaneContext(networks, [(1, 4, 4)]))  # the kernel is loaded
 data = Path(sys.argv[1]).read_bytes()
 before = kilobytes("VmRSS:")
-PlaneCoder().decode(data, PlaneContext(networks, [(1, 700, 700)]))
+PlaneCoder().decode(data, PlaneContext(networks, [(1, 400, 400)]))
 print((kilobytes("VmHWM:") - before) * 1024)
 """
 
@@ -104,11 +104,11 @@ def test_planes_of_one_channel_take_no_more_than_their_size_allows(tmp_path):
     if not EXACT.try_load():
         pytest.skip("no compiler: nothing is decoded side by side")
     networks = [SpatialAr(torch.Generator().manual_seed(seed)).exact() for seed in range(3)]
-    for name, size in (("large", 700), ("small", 4)):
+    for name, size in (("large", 400), ("small", 4)):
         (tmp_path / name).write_bytes(plane_lists.encode([np.zeros((3, 1, size, size), np.int64)], networks))
     command = [sys.executable, "-c", MEMORY, str(tmp_path / "large"), str(tmp_path / "small")]
     found = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert int(found.stdout) < 4 * (4 * 3 * 700 * 700)  # integers of 32 bits
+    assert int(found.stdout) < 4 * (4 * 3 * 400 * 400)  # integers of 32 bits
 
 
 def test_what_is_decoded_together_does_not_matter():

@@ -27,7 +27,7 @@ SMALL = {
     "lr.channel_final": 2e-3, "rate_term.start": "statistics", "rate_term.units": "steps", "steps.scales": 0.004,
     "channel.slices": [4, 4], "channel.hidden": 8, "rate_term.sample": 0.5,
 }  # fmt: skip
-WEIGHTS = (0.001, 0.01, 0.05)
+WEIGHTS = (0.001, 0.05)
 
 
 @pytest.fixture(scope="module")
@@ -68,12 +68,11 @@ def test_a_larger_weight_prunes_and_gives_a_smaller_and_worse_file(scene, raster
         counts.append(model.counts()["num_gaussians"])
         files.append(ContainerReader(data))
         quality.append(psnr(decoded(data), scene, rasterizer))
-    assert counts[0] > counts[1] > counts[2]
-    assert counts[2] < 0.9 * counts[0]
+    assert counts[1] < 0.9 * counts[0]
     for name in ("features.1", "features.2", "offsets"):
         sizes = [reader.sections[name] for reader in files]
-        assert sizes[0] > sizes[1] > sizes[2], name
-    assert quality[0] > quality[1] > quality[2]
+        assert sizes[0] > sizes[1], name
+    assert quality[0] > quality[1]
 
 
 def test_the_file_holds_what_was_learned(scene, rasterizer, trained):

@@ -23,7 +23,7 @@ SMALL = {
     "lr.masks_final": 4e-3, "lr.grid_final": 1e-3, "lr.mlp_grid_final": 1e-3, "rate_term.start": "statistics",
     "rate_term.units": "steps", "steps.scales": 0.004,
 }  # fmt: skip
-WEIGHTS = (0.001, 0.006, 0.03)
+WEIGHTS = (0.001, 0.03)
 
 
 @pytest.fixture(scope="module")
@@ -70,8 +70,8 @@ def test_a_larger_weight_gives_a_smaller_and_worse_file(scene, rasterizer, train
         data = file_of(made, model)
         sizes.append(len(data))
         quality.append(psnr(decoded(data), scene, rasterizer))
-    assert sizes[0] > sizes[1] > sizes[2]
-    assert quality[0] > quality[1] > quality[2]
+    assert sizes[0] > sizes[1]
+    assert quality[0] > quality[1]
 
 
 def test_the_file_holds_what_was_learned(scene, rasterizer, trained):

@@ -154,7 +154,8 @@ def register_methods(registry):
 
 @pytest.mark.parametrize(
     ("line", "said"),
-    [("import torch", "imports torch"), ("print('hello')", "prints 'hello'"), ("1 / 0", "ZeroDivisionError"),
+    [("import sys; sys.modules['torch'] = sys", "imports torch"),
+     ("print('hello')", "prints 'hello'"), ("1 / 0", "ZeroDivisionError"),
      ("for _ in range(30_000):\n        pass", r"executes 6\d,\d{3} lines of Python, at most 50,000"),
      ("import numpy", "lines of Python")],
 )  # fmt: skip

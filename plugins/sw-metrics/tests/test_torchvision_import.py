@@ -2,10 +2,9 @@
 
 import importlib
 import importlib.util
-import subprocess
-import sys
 
 import pytest
+from forked_children import run_python
 from sw_metrics.torchvision_import import import_torchvision
 
 needs_torchvision = pytest.mark.skipif(
@@ -26,7 +25,7 @@ assert torchvision is module
 torchvision.models.alexnet(weights=None)
 print(torch.ops.torchvision.nms.default._schema)
 """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300, check=False)
+    done = run_python("-c", program)
     assert done.returncode == 0, done.stderr
     assert "torchvision::nms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor" in done.stdout
 
