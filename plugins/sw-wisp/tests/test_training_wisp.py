@@ -209,7 +209,7 @@ def test_estimated_bits_are_those_of_the_file(whole):
 
 
 def test_more_lambda_leaves_fewer_splats_and_a_smaller_file(train):
-    few, many = (train(rate_term__lambda_=value) for value in (3e-3, 1e-5))
+    few, many = (train(context__kind="none", rate_term__lambda_=value) for value in (3e-3, 1e-5))
     assert few[1].num_rows < many[1].num_rows
     assert len(file_of(*few)) < len(file_of(*many))
 
