@@ -26,8 +26,8 @@ def test_there_are_cuda_sources_to_compile():
 def test_it_compiles_without_a_torch_header(module, source, tmp_path):
     # To PTX that nobody optimised: all of the language is checked; assembling for one GPU takes ten times as long.
     command = [
-        str(NVCC), "-std=c++20", "-arch=sm_90", "-Xcicc", "-O0", "-DSW_WITH_CUDA", "-isystem", str(toolchain.SHARED_INCLUDE),
-        "-Werror", "all-warnings", "-MD", "-MF", str(tmp_path / "read"),
+        str(NVCC), "-std=c++20", "-arch=sm_90", "-Xcicc", "-O0", "-DSW_WITH_CUDA",
+        "-isystem", str(toolchain.SHARED_INCLUDE), "-Werror", "all-warnings", "-MD", "-MF", str(tmp_path / "read"),
         "-ptx", str(module._root() / source), "-o", str(tmp_path / "out.ptx"),
     ]  # fmt: skip
     done = subprocess.run(command, capture_output=True, text=True, check=False)

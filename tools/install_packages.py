@@ -28,7 +28,8 @@ def main() -> None:
     parser.add_argument("folders", nargs="+", type=Path)
     given = parser.parse_args()
     constraint, folders = str(given.constraint.resolve()), [folder.resolve() for folder in given.folders]
-    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "install", "-q", "--no-compile", "-c", constraint]
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "install", "-q", "--no-compile"]
+    pip += ["-c", constraint]
     with tempfile.TemporaryDirectory() as made:
         wheels = [Path(made) / editable_wheel(folder, made) for folder in folders]
         subprocess.run([*pip, "--no-deps", "--force-reinstall", *map(str, wheels)], check=True)

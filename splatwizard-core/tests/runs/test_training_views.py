@@ -1,4 +1,4 @@
-"""PSNR over the training views: what the record holds of it, and when a run warns of a collapse."""
+"""PSNR over the training views: what the record holds of it."""
 
 import math
 from pathlib import Path
@@ -11,10 +11,10 @@ import torch
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.runs.config import parse_set, resolve
 from splatwizard_core.runs.directory import RunRequest
-from splatwizard_core.runs.record import MetricBlock, Record, TrainingPsnrBlock, read_record
+from splatwizard_core.runs.record import Record, read_record
 from splatwizard_core.runs.run import run
 from splatwizard_core.runs.session import Session
-from splatwizard_core.runs.training_views import collapse_warning, summary, training_psnr
+from splatwizard_core.runs.training_views import summary, training_psnr
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import Protocol, Scene, View
 
@@ -74,54 +74,6 @@ def test_what_is_not_finite_is_null_with_its_reason():
     assert of_black_model() == (None, {"training_psnr": "the scene has no training views"})
 
 
-class TestWarning:
-    """One line, or none."""
-
-    @staticmethod
-    def warning(training: dict[str, Any] | None, test: float | None = 30.0) -> str | None:
-        sound = {"mean": 30.0, "median": 30.0, "quantile_05": 25.0, "far_below": {}}
-        block = None if training is None else TrainingPsnrBlock.model_validate({**sound, **training})
-        psnr = MetricBlock(mean=test, per_view=[], direction="higher")
-        # The rest of a record plays no part.
-        record = Record.model_construct(
-            method="toy", rate="r1", train_views=60, metrics={"psnr": psnr}, training_psnr=block
-        )
-        return collapse_warning(record)
-
-    def test_a_sound_training_is_not_warned_of(self):
-        assert self.warning({}) is None
-        assert self.warning({"mean": 33.0}) is None  # 3 dB and no more
-        assert self.warning(None) is None
-        assert self.warning({"mean": None}, 10.0) is None
-        assert self.warning({"mean": 40.0}, None) is None
-
-    def test_single_views_are_named_with_their_figures_and_what_to_look_at(self):
-        line = self.warning({"far_below": {"b.png": 12.04, "e.png": 21.9}})
-        assert line is not None
-        assert "\n" not in line
-        assert "toy r1: 2 of 60 training views lie more than 8 dB below their median of 30.0 dB" in line
-        assert "(b.png 12.0, e.png 21.9)" in line
-        assert "sw render --views train" in line
-
-    def test_many_views_are_counted(self):
-        line = self.warning({"far_below": {f"{i}.png": float(i) for i in range(9)}})
-        assert "9 of 60" in (line or "")
-        assert "2.png 2.0 and 6 more)" in (line or "")
-
-    def test_test_views_far_below_training_views_are_told_with_both_means(self):
-        line = self.warning({"mean": 33.2}, 30.1)
-        assert line is not None
-        assert "test views have 30.1 dB in the mean, training views 33.2" in line
-
-    def test_both_stand_in_one_line(self):
-        line = self.warning({"mean": 36.0, "far_below": {"a.png": 3.0}})
-        assert line is not None
-        assert line.count("warning") == 1
-        assert "a.png 3.0" in line
-        assert "36.0" in line
-        assert "\n" not in line
-
-
 @pytest.fixture(scope="module")
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("out")
@@ -157,19 +109,11 @@ class TestRun:
         assert read_record(directory / "metrics.json") == record
 
     def test_it_can_be_left_out_and_what_is_there_is_kept(self, toy_plugins: PluginManager, tmp_path: Path):
-        record, _, said = self.go(toy_plugins, tmp_path, "eval_train=false")
+        record, _, _ = self.go(toy_plugins, tmp_path, "eval_train=false")
         assert record.training_psnr is None
         assert "eval_train" in record.unknown["training_psnr"]
-        assert not any(line.startswith("warning") for line in said)
         asked, _, said = self.go(toy_plugins, tmp_path)
         assert asked.training_psnr is not None
         assert not any(line.startswith(("training toy", "encoded", "decoded")) for line in said)  # evaluated alone
         assert asked.metrics["psnr"] == record.metrics["psnr"]
         assert self.go(toy_plugins, tmp_path, "eval_train=false")[0].training_psnr == asked.training_psnr
-
-    def test_a_collapse_is_said_also_of_a_finished_run(self, toy_plugins: PluginManager, out: Path, monkeypatch):
-        self.go(toy_plugins, out)
-        monkeypatch.setattr("splatwizard_core.runs.training_views.LARGEST_GAP", -100.0)
-        *_, said = self.go(toy_plugins, out)
-        assert any("is finished" in line for line in said)
-        assert [line for line in said if line.startswith("warning: toy r1: test views have")] == said[-1:]

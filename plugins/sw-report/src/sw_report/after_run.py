@@ -12,6 +12,7 @@ from pathlib import Path
 from splatwizard_core.api import Scene
 from splatwizard_core.tooling import FILE_NAME as RECORD
 from splatwizard_core.tooling import FinishedRuns, ForeseenError, write_atomic
+from sw_report.collapse import collapse_warning
 from sw_report.facts import read_facts
 from sw_report.page import FILE_NAME, write_page
 from sw_report.rd_file import FILE_NAME as PLOT_NAME
@@ -22,11 +23,13 @@ from sw_report.truth import keep_truth
 
 
 def report_finished(runs: FinishedRuns) -> None:
-    """Write the page of each run as it finishes; at the end print the table, and write what is about all of them."""
+    """Write the page of each run as it finishes, and tell of collapses; at the end the table, and what is about all."""
     directories = [run.directory for run in runs.runs]
     if not runs.complete:
         pages = [report_run(run.directory, run.open_scene, runs.say) for run in runs.runs]
         runs.written.extend(page for page in pages if page is not None)
+        for line in filter(None, (collapse_warning(run.record) for run in runs.runs)):
+            runs.say(line)
         return
     above = [report_above(directories, runs.say), plot_above(directories, runs.say)]
     if any(above):  # the pages of single runs lie beside their records

@@ -35,7 +35,6 @@ from splatwizard_core.runs.phases import phases_of_run
 from splatwizard_core.runs.pretrained import make_method
 from splatwizard_core.runs.session import Session, TrainedModel
 from splatwizard_core.runs.training import train
-from splatwizard_core.runs.training_views import collapse_warning
 
 MEASURING = 2  # raised when `sw decode` and `sw eval` come to report more: a step that reported less is done again
 
@@ -89,7 +88,7 @@ def run(session: Session, request: RunRequest) -> tuple[schema.Record, Path]:
                 record = schema.read_record(directory / schema.FILE_NAME)
                 if record.file.sha256 == encoding.sha256:
                     session.say(f"{directory} is finished; nothing to do (--fresh does it again)")
-                    return _warned(session, record), directory
+                    return record, directory
         training = steps.done("train", train_key, TrainingFacts) or train_in(session, request, directory).facts
         write_config(directory, resolved)
         decoded = steps.once(
@@ -108,15 +107,7 @@ def run(session: Session, request: RunRequest) -> tuple[schema.Record, Path]:
         record.write(directory / schema.FILE_NAME)
         done = Recorded(sha256=encoding.sha256, asked=measured.asked or asked)
         steps.finish("record", keys["record"], done)
-    return _warned(session, record), directory
-
-
-def _warned(session: Session, record: schema.Record) -> schema.Record:
-    """Return the record; the user is told if its training views show a collapse."""
-    warning = collapse_warning(record)
-    if warning is not None:
-        session.say(warning)
-    return record
+    return record, directory
 
 
 def train_only(session: Session, request: RunRequest) -> tuple[TrainedModel, Path]:

@@ -1,8 +1,4 @@
-"""PSNR over the views that a model was trained on, and what it tells beside the test views: a training that collapsed.
-
-Test views alone do not say whether the model is bad or the views are new. Training views that lie far below the others
-show a part of the scene that is not there; training views far above the test views, one that was learnt by heart.
-"""
+"""PSNR over the views that a model was trained on: test views alone do not say whether it is bad or they are new."""
 
 from __future__ import annotations
 
@@ -16,14 +12,12 @@ from torch import Tensor
 from splatwizard_core.base.progress import track
 from splatwizard_core.evaluation.evaluate import INFINITE, NOT_A_NUMBER
 from splatwizard_core.evaluation.image import prepare_render, psnr
-from splatwizard_core.runs.record import Record, TrainingPsnrBlock
+from splatwizard_core.runs.record import TrainingPsnrBlock
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.images import decoded_ahead
 from splatwizard_core.scene.scene import Scene
 
-FAR_BELOW = 8.0  # dB from the median of the training views down to one that is warned of
-LARGEST_GAP = 3.0  # dB between the means of training and of test views
-MAX_NAMED = 3  # views that a warning names
+FAR_BELOW = 8.0  # dB from the median of the training views down to one that is named
 SHARE = 0.05  # of the training views that lie at or below `quantile_05`
 
 
@@ -62,29 +56,3 @@ def summary(values: dict[str, float]) -> tuple[TrainingPsnrBlock | None, dict[st
     reasons = {f"training_psnr.{name}": INFINITE for name, value in finite.items() if value is None}
     far = [name for name in ordered if math.isfinite(median) and values[name] < median - FAR_BELOW]
     return TrainingPsnrBlock(**finite, far_below={name: values[name] for name in far}), reasons
-
-
-def collapse_warning(record: Record) -> str | None:
-    """One line for the user if training views of a record tell that the training went wrong; None: they do not."""
-    training, test = record.training_psnr, record.metrics.get("psnr")
-    if training is None:
-        return None
-    told = [_far_below(training, record.train_views or 0)] if training.far_below else []
-    means = training.mean, None if test is None else test.mean
-    if means[0] is not None and means[1] is not None and means[0] - means[1] > LARGEST_GAP:
-        told.append(
-            f"test views have {means[1]:.1f} dB in the mean, training views {means[0]:.1f}: these are learnt by heart, "
-            "or the test views are of another kind (path, exposure, poses); look at the worst of them in renders/"
-        )
-    return f"warning: {record.method} {record.rate}: {'; '.join(told)}" if told else None
-
-
-def _far_below(training: TrainingPsnrBlock, views: int) -> str:
-    names = [f"{name} {value:.1f}" for name, value in list(training.far_below.items())[:MAX_NAMED]]
-    more = len(training.far_below) - len(names)
-    listed = ", ".join(names) + (f" and {more} more" if more else "")
-    return (
-        f"{len(training.far_below)} of {views} training views lie more than {FAR_BELOW:.0f} dB below their median of "
-        f"{training.median:.1f} dB ({listed}): part of the scene is missing, or their poses are off; look at them with "
-        "`sw render --views train`, and train with another seed or more start points"
-    )
