@@ -28,27 +28,32 @@ STRANGERS = sorted(p for folder in ("examples", "tests/plugins") for p in ROOT.g
 """Packages as third parties would write them."""
 
 
-@cache
 def imported(path: Path, *, types: bool = False) -> tuple[str, ...]:
     """Dotted names of all modules that a file imports, at any depth.
 
     types: also those under `if TYPE_CHECKING:`
     """
-    found: list[str] = []
+    return tuple(name for name, for_types in _imports(path) if types or not for_types)
 
-    def visit(node: ast.AST) -> None:
+
+@cache
+def _imports(path: Path) -> list[tuple[str, bool]]:
+    """Those names, and whether each stands under `if TYPE_CHECKING:`."""
+    found: list[tuple[str, bool]] = []
+
+    def visit(node: ast.AST, for_types: bool) -> None:
         if isinstance(node, ast.Import):
-            found.extend(alias.name for alias in node.names)
+            found.extend((alias.name, for_types) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
-            found.extend(f"{node.module}.{alias.name}" for alias in node.names)
+            found.extend((f"{node.module}.{alias.name}", for_types) for alias in node.names)
         typing_only = isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING")
-        for child in node.orelse if typing_only and not types else ast.iter_child_nodes(node):
+        for child in ast.iter_child_nodes(node):
             if not isinstance(child, ast.expr):
-                visit(child)
+                visit(child, for_types or (typing_only and child not in node.orelse))
 
-    visit(ast.parse(path.read_text(encoding="utf-8")))
-    return tuple(found)
+    visit(ast.parse(path.read_text(encoding="utf-8")), False)
+    return found
 
 
 def files_of(package: Path) -> list[Path]:
