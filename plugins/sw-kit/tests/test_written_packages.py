@@ -56,11 +56,10 @@ def test_every_kind_but_methods_keeps_its_contract(written, tmp_path):
 
 
 @pytest.mark.pipeline
-@pytest.mark.parametrize("kind", ["anchors", pytest.param("method", marks=pytest.mark.slow),
-                                  pytest.param("post-training", marks=pytest.mark.slow),
-                                  pytest.param("rasterizer", marks=pytest.mark.slow)])  # fmt: skip
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["anchors", "method", "post-training", "rasterizer"])
 def test_a_method_passes_the_whole_check(written, tmp_path, kind):
-    """By default anchors: a plain AnchorModel in an AnchorStage. Post-training is the tutorial's."""
+    """By default the tutorial's package does, and these pass their own tests."""
     found = check(written, [kind], tmp_path)
     assert [row for row in found if row["state"] != "ok"] == []
     if kind != "rasterizer":
