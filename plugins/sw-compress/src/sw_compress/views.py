@@ -47,17 +47,20 @@ class Views:
         }  # fmt: skip
 
 
-def views_of(model: GaussianModel, rasterizer: Rasterizer, cameras: Path | None, count: int | None) -> Views:
-    """Cameras of a file, or made up, `count` in all; None: by the number of Gaussians."""
-    if cameras is not None:
-        found = read_cameras(cameras).cameras
-        if len(found) < 3:
-            raise UserInputError(f"{cameras}: {len(found)} cameras; at least 3 are needed, of which 2 are set aside")
-        aside = max(1, round(len(found) * HELD_OUT))
-        places = set(_even(len(found), 2 * aside))
-        chosen = [camera for i, camera in enumerate(found) if i in places]
-        rest = [camera for i, camera in enumerate(found) if i not in places]
-        return Views(cameras.name, "given", rest, chosen[::2], chosen[1::2])
+def views_of_file(path: Path) -> Views:
+    """Cameras of a file, at least 3. Raises SceneError, UserInputError."""
+    found = read_cameras(path).cameras
+    if len(found) < 3:
+        raise UserInputError(f"{path}: {len(found)} cameras; at least 3 are needed, of which 2 are set aside")
+    aside = max(1, round(len(found) * HELD_OUT))
+    places = set(_even(len(found), 2 * aside))
+    chosen = [camera for i, camera in enumerate(found) if i in places]
+    rest = [camera for i, camera in enumerate(found) if i not in places]
+    return Views(path.name, "given", rest, chosen[::2], chosen[1::2])
+
+
+def made_up_views(model: GaussianModel, rasterizer: Rasterizer, count: int | None) -> Views:
+    """Cameras from the scene alone, `count` in all; None: by the number of Gaussians."""
     device = model.device.type
     if count is None:
         count = min(max(int(DRAWN[device] / model.num_rows), LEAST[device]), MOST[device])
