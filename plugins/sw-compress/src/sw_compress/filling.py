@@ -31,7 +31,7 @@ STEPS = (1.0, 0.5, 0.25, 0.125, 0.0625, 0.03125)
 
 @dataclass(frozen=True)
 class Filled:
-    """What was written.
+    """File that was written.
 
     encodes     how often a file was written on the way
     """

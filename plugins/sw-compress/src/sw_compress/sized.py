@@ -11,6 +11,7 @@ import torch
 from pydantic import Field
 from sw_gaussians.byte_sizes import parse_size
 from sw_gaussians.choices import CodecChoice
+from sw_gaussians.surfels import refuse_surfels
 
 from splatwizard_core.api import GaussianModel, Params, RasterOptions
 from splatwizard_core.tooling import NegotiatedRasterizer, say
@@ -26,9 +27,6 @@ from sw_compress.views import made_up_views, training_views
 if TYPE_CHECKING:
     from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager, Scene
 
-INNER = "gaussians-quantized"
-"""Codec whose file it is."""
-
 
 class SizedSettings(Params):
     """The size."""
@@ -42,6 +40,7 @@ class Sized:
     A file of it is one of that codec, and is read by it.
     """
 
+    WRITES: ClassVar[str] = "gaussians-quantized"
     Settings: ClassVar[type[SizedSettings]] = SizedSettings
 
     def __init__(self, plugins: PluginManager, **settings: Any) -> None:
@@ -58,10 +57,11 @@ class Sized:
         raster      what the file asks of a renderer
         scene       that the model was trained on; None: cameras are made up
 
-        Raises UserInputError for a size out of reach.
+        Raises UserInputError for a size out of reach, and for surfels.
         """
         if self._size is None:
-            return model, CodecChoice(name=INNER)
+            return model, CodecChoice(name=self.WRITES)
+        refuse_surfels(model, f"a size of {self.settings.size}")
         options = {key: value for key, value in raster.items() if key in ("antialias", "eps2d") and value is not None}
         rasterizer = NegotiatedRasterizer(self.plugins, device=model.device, options=options)
         coder = Quantized(self.plugins, raster, method, None if scene is None else scene.origin)
@@ -84,4 +84,4 @@ class Sized:
         codec.load(self.plugins).encode(model, writer)
 
     def decode(self, reader: ContainerReader) -> GaussianModel:
-        return self.plugins.gaussian_codecs.load(INNER)(self.plugins).decode(reader)
+        return self.plugins.gaussian_codecs.load(self.WRITES)(self.plugins).decode(reader)

@@ -40,14 +40,9 @@ NEEDED_KINDS = ("method", "quantizer", "entropy model", "context model", "coder"
 
 
 def encode(
-    method: Method,
-    model: SplatModel,
-    raster: dict[str, Any],
-    path: Path,
-    origin: Origin = NOWHERE,
-    *,
+    method: Method, model: SplatModel, raster: dict[str, Any], path: Path, origin: Origin = NOWHERE, *,
     deterministic: bool = False,
-) -> EncodingFacts:
+) -> EncodingFacts:  # fmt: skip
     """Write one file; returns the facts of the encoding, for the record and for what is done again later.
 
     raster          what the header asks of a rasterizer
