@@ -170,6 +170,15 @@ def test_the_number_and_the_degree_may_be_given(source):
     assert (done.record["gaussians"], done.record["sh_degree"]) == (250, 0)
 
 
+def test_a_refined_file_has_its_size_and_is_no_worse(ball):
+    done = compress(ball(200), size="2500", views=9, device="cpu", refine=1.0)
+    assert 0.99 * 2_500 < done.record["bytes"] <= 2_500
+    told = done.record["refined"]
+    assert told["steps"] > 0
+    assert told["psnr_after"] >= told["psnr_before"]
+    assert done.record["seconds"]["refine"] >= 1
+
+
 def test_several_files_of_which_some_fail(source, tmp_path):
     broken = tmp_path / "broken.ply"
     broken.write_bytes(b"ply\nformat binary_little_endian 1.0\n")
@@ -214,6 +223,7 @@ def test_a_source_is_never_replaced(small):
         ("ball.ply", ["--out", "folder"], "folder is a folder: give the name of a file in it"),
         ("ball.ply", ["--out", "a.zip"], "a.zip: a file of this name would hold swz, .*: give --out FILE.swz"),
         ("ball.ply", ["--out", "b.swz", "--format", "spz"], "b.swz: a file of this name would hold spz"),
+        ("ball.ply", ["--refine", "5", "--format", "spz"], "only .swz files are refined, not .spz"),
         ("ball.ply", ["--cameras", "a.txt"], "a.txt: not a JSON file of cameras"),
     ],
 )

@@ -72,8 +72,12 @@ class Quantized:
 
     def settings(self, levels: Levels) -> QuantizedSettings:
         """Settings of the codec."""
-        steps = {f"{name}_step": STEPS[name] * 2.0 ** levels.get(name, 0.0) for name in STEPS}
+        steps = {f"{name}_step": step for name, step in self.steps(levels).items()}
         return QuantizedSettings(position_bits=int(POSITION_BITS - levels[POSITIONS]), **steps)
+
+    def steps(self, levels: Levels) -> dict[str, float]:
+        """Quantiser steps by attribute, of all but the positions."""
+        return {name: step * 2.0 ** levels.get(name, 0.0) for name, step in STEPS.items()}
 
     def finest(self, model: GaussianModel) -> dict[str, float]:
         """Levels at which nothing is lost that could be seen."""

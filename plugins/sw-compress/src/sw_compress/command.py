@@ -53,12 +53,14 @@ FORMATS = ("swz", "sog", "spz")
     click.option("--sh-degree", type=click.IntRange(0, 3), metavar="D",
                  help="Highest degree of the spherical harmonics.  [default: the source's]"),
     click.option("--drop-unseen", is_flag=True, help="Let go what no camera shows."),
+    click.option("--refine", type=click.FloatRange(0, 86_400), default=0.0, metavar="SECONDS",
+                 help="Train what stays on pictures of the source for so long, .swz alone.  [default: 0, not]"),
     device_option, json_option, debug_option,
 )  # fmt: skip
 def compress(
     files: tuple[Path, ...], size: str | None, quality: str | None, ratio: str | None, out: str | None,
     format_name: str | None, cameras: Path | None, views: int | None, gaussians: int | None, sh_degree: int | None,
-    drop_unseen: bool, device: str | None, as_json: bool,
+    drop_unseen: bool, refine: float, device: str | None, as_json: bool,
 ) -> None:  # fmt: skip
     """Make FILE small without its photographs: fewer Gaussians, each as precise as its part in the picture asks for.
 
@@ -86,7 +88,7 @@ def compress(
             with _there(place.parent):
                 done = make(
                     file, size=size, quality=quality, ratio=ratio, out=place, format=format_name, cameras=cameras,
-                    views=views, gaussians=gaussians, sh_degree=sh_degree, drop_unseen=drop_unseen,
+                    views=views, gaussians=gaussians, sh_degree=sh_degree, drop_unseen=drop_unseen, refine=refine,
                     device=device or "auto", say=say,
                 )  # fmt: skip
         except ForeseenError as error:

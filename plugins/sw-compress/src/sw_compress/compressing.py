@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from splatwizard_core.api import GaussianModel, PluginManager, RasterOptions, UserInputError, replacing
+from splatwizard_core.api import Camera, GaussianModel, PluginManager, RasterOptions, UserInputError, replacing
 from splatwizard_core.tooling import OUTPUT_FILE, NegotiatedRasterizer, choose_device, load_plugins, open_model
 from sw_compress.coders import Quantized
 from sw_compress.filling import Filled, fill
@@ -19,14 +19,17 @@ from sw_compress.formats import FORMATS, FormatFile, format_file
 from sw_compress.measuring import Errors
 from sw_compress.pruning import Pruning
 from sw_compress.quality import PHOTOGRAPHS, Pictures, loss_against_photographs, told_loss
+from sw_compress.refining import Refined, refine
 from sw_compress.rows import with_degree
-from sw_compress.search import Search, for_quality
+from sw_compress.search import Choice, Search, for_quality, measured_again
 from sw_compress.source import Source, open_source
 from sw_compress.stages import Stages, peak_bytes
 from sw_compress.targets import Target
 from sw_compress.views import made_up_views, views_of_file
 
 SWZ = "swz"
+LONGEST = 86_400
+"""Seconds that a refinement may take."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,7 @@ def compress(
     gaussians: int | None = None,
     sh_degree: int | None = None,
     drop_unseen: bool = False,
+    refine: float = 0.0,
     device: str = "auto",
     plugins: PluginManager | None = None,
     say: Callable[[str], None] = lambda line: None,
@@ -76,10 +80,11 @@ def compress(
     gaussians   number that stays, the most significant ones; None: what gives the best picture
     sh_degree   highest degree of the spherical harmonics; None: the source's
     drop_unseen whether what no camera shows may go; it does where `gaussians` is given
+    refine      seconds of training on pictures of the source, for a .swz; 0: none
     say         takes lines for the user
 
-    Equal files, options and kind of device give equal bytes. Raises UserInputError for a target out of reach,
-    SceneError and BitstreamError for a source that cannot be used.
+    Equal files, options and kind of device give equal bytes, but for what `refine` makes in its time. Raises
+    UserInputError for a target out of reach, SceneError and BitstreamError for a source that cannot be used.
     """
     # What is wrong with what is asked for is told before a large file is read.
     if format not in (SWZ, *FORMATS):
@@ -87,6 +92,10 @@ def compress(
     Target.of(size, quality, ratio, 0)
     if gaussians is not None and gaussians < 1:
         raise UserInputError(f"{gaussians} Gaussians: at least 1 must stay")
+    if not 0 <= refine <= LONGEST:
+        raise UserInputError(f"refine {refine:g}: must be a number of seconds in 0 .. {LONGEST:,}")
+    if refine and format != SWZ:
+        raise UserInputError(f"only .swz files are refined, not .{format}: leave out one of the two")
     if out is not None:
         OUTPUT_FILE.check(os.fspath(out))
     given = None if cameras is None else views_of_file(Path(cameras))
@@ -104,7 +113,9 @@ def compress(
         held_out = Pictures(source.model, seen.held_out, rasterizer, options)
     keeps_unseen = not drop_unseen and given is None and gaussians is None
     pruning = Pruning(model, seen.fit, rasterizer, keeps_unseen=keeps_unseen)
-    work = _Work(source, model, judge, held_out, pruning, target, gaussians, stages, plugins, say)
+    work = _Work(
+        source, model, judge, held_out, pruning, seen.fit, rasterizer, refine, target, gaussians, stages, plugins, say
+    )
     make = _make_swz if format == SWZ else _make_other(format)
     if out is not None:
         with replacing(out) as temporary:
@@ -152,6 +163,9 @@ class _Work:
     judge: Pictures
     held_out: Pictures
     pruning: Pruning
+    fit: list[Camera]
+    rasterizer: NegotiatedRasterizer
+    refine: float
     target: Target
     gaussians: int | None
     stages: Stages
@@ -164,12 +178,25 @@ def _make_swz(work: _Work, path: Path) -> tuple[GaussianModel, dict[str, Any]]:
     with work.stages.timed("sensitivities"):
         errors = Errors(coder, work.model, work.judge)
     search = Search(coder, work.model, work.pruning, work.judge, errors, work.gaussians)
+    refined: Refined | None = None
+
+    def better(choice: Choice) -> Choice:
+        nonlocal refined
+        levels = choice.allocation.levels
+        with work.stages.timed("refine"):
+            refined = refine(choice.model, work.model, work.fit, work.rasterizer, coder, levels, seconds=work.refine)
+        return Choice(refined.model, errors.curves(coder, refined.model), choice.allocation)
+
     if work.target.size is not None:
         filled = fill(search, work.target.size, path, work.stages, work.say)
+        if work.refine:
+            filled = fill(search, work.target.size, path, work.stages, work.say, better(filled.choice))
     else:
         assert work.target.quality is not None  # one of the two is given
         with work.stages.timed("search"):
             choice = for_quality(search, work.target.quality, work.held_out)
+        if work.refine:
+            choice = measured_again(search, better(choice), work.target.quality, work.held_out)
         with work.stages.timed("encode"):
             filled = Filled(choice, coder.encode(choice.model, choice.allocation.levels, path), 1)
     with work.stages.timed("decode"):
@@ -180,6 +207,7 @@ def _make_swz(work: _Work, path: Path) -> tuple[GaussianModel, dict[str, Any]]:
         "sections": {"header": reader.header_bytes, **reader.sections},
         "precision": coder.settings(filled.choice.allocation.levels).model_dump(exclude={"positions", "entropy"}),
         "encodes": filled.encodes,
+        "refined": None if refined is None else refined.as_dict(),
         "tried": [{"gaussians": n, "bytes": round(b), "psnr": round(q, 2)} for n, b, q in search.tried],
     }
     return model, facts

@@ -61,8 +61,16 @@ class _File:
         return self.bytes
 
 
-def fill(search: Search, size: int, path: Path, stages: Stages, say: Callable[[str], None]) -> Filled:
-    """Write the best file of at most `size` bytes. Raises UserInputError that names the smallest there is."""
+def fill(
+    search: Search, size: int, path: Path, stages: Stages, say: Callable[[str], None],
+    chosen: Choice | None = None,
+) -> Filled:  # fmt: skip
+    """Write the best file of at most `size` bytes.
+
+    chosen  Gaussians that stay, and their precision to begin with; None: what the search finds
+
+    Raises UserInputError that names the smallest file there is.
+    """
     file = _File(search.coder, path, stages)
 
     def choose(budget: float) -> Choice | None:
@@ -72,7 +80,7 @@ def fill(search: Search, size: int, path: Path, stages: Stages, say: Callable[[s
     least = least_bytes(search)
     if least > 2 * size:
         raise _too_small(size, f"about {least:,.0f}")
-    choice, best, most = choose(size), None, 0
+    choice, best, most = chosen or choose(size), None, 0
     while choice is not None:
         written = file.write(choice.model, choice.allocation.levels)
         if most < written <= size:
@@ -81,9 +89,10 @@ def fill(search: Search, size: int, path: Path, stages: Stages, say: Callable[[s
             break
         budget = choice.bytes + AIM * size - written
         far_off = abs(choice.bytes / written - 1) > FAR_OFF
-        choice = choose(budget) if far_off else choice.resized(budget)
-    if best is None and search.coarsest is not None:
-        best = search.coarsest
+        choice = choose(budget) if far_off and chosen is None else choice.resized(budget)
+    coarsest = search.coarsest if chosen is None else chosen.coarsest()
+    if best is None and coarsest is not None:
+        best = coarsest
         most = file.write(best.model, best.allocation.levels)
         if most > size:
             raise _too_small(size, f"{most:,}")

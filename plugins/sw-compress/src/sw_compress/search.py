@@ -96,6 +96,10 @@ class Choice:
         """True where nothing can be more precise."""
         return all(self.allocation.levels[curve.name] == curve.levels[0] for curve in self.curves)
 
+    def coarsest(self) -> Choice:
+        """The same Gaussians as coarse as can be."""
+        return replace(self, allocation=at_price(self.curves, COARSEST_PRICE))
+
     def placed(self) -> list[Curve]:
         """The curves with places as precise as here."""
         return [self._fixed(curve) if curve.name == POSITIONS else curve for curve in self.curves]
@@ -169,6 +173,11 @@ def for_quality(search: Search, quality: float, held_out: Pictures) -> Choice:
     raise UserInputError(
         f"the finest settings reach {finest:.1f} dB against the source, which is less than {quality:g} dB"
     )
+
+
+def measured_again(search: Search, choice: Choice, quality: float, held_out: Pictures) -> Choice:
+    """The choice as coarse as the quality allows, or as it is."""
+    return _measured(search, choice, quality, held_out)[1] or choice
 
 
 def _measured(search: Search, choice: Choice, quality: float, held_out: Pictures) -> tuple[float, Choice | None]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from pydantic import Field
-from sw_gaussians.byte_sizes import parse_size
+from sw_gaussians.byte_sizes import ByteSize, parse_size
 from sw_gaussians.choices import CodecChoice
 from sw_gaussians.surfels import refuse_surfels
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 class SizedSettings(Params):
     """The size."""
 
-    size: str = Field("", description="bytes of the file, never more: 5MB; empty: as its usual steps come to")
+    size: ByteSize = Field("", description="bytes of the file, never more: 5MB; empty: as its usual steps come to")
 
 
 class Sized:
