@@ -270,3 +270,15 @@ def test_the_order_of_the_models_anchors_is_no_matter():
         for name in ("anchors", "features", "offsets", "log_scales", "mask_logits"):
             getattr(shuffled, name).copy_(getattr(model, name)[order])
     assert encoded(shuffled) == encoded(model)
+
+
+@pytest.mark.parametrize("kind", ["full", "none"])
+def test_a_file_of_a_size_decodes(kind):
+    """Features keep their step where a network has learnt to read them in it."""
+    model = make(n=2000, channel__kind=kind)
+    size = int(0.95 * len(encoded(model, channel__kind=kind)))
+    data = encoded(model, channel__kind=kind, size=str(size))
+    assert 0.96 * size - 1_000 < len(data) <= size
+    steps = ContainerReader(data).static["base_steps"]
+    assert [a > b for a, b in zip(steps, model.base_steps, strict=True)] == [kind == "none", True, True]
+    assert decoded(data).num_rows == int(model.kept().sum())

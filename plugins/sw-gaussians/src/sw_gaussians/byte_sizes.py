@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import re
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator
 
 from splatwizard_core.api import UserInputError
 
@@ -21,3 +24,17 @@ def parse_size(text: str | int) -> int:
     if not 1 <= found <= LARGEST:
         raise UserInputError(f"size '{text}' must be 1 byte to {LARGEST >> 40:,} TiB")
     return int(found)
+
+
+def _checked(value: Any) -> str:
+    if value == "":
+        return ""
+    try:
+        parse_size(value)
+    except UserInputError:
+        raise ValueError("bytes, or a number with kB, MB, GB, KiB, MiB or GiB") from None
+    return str(value)
+
+
+ByteSize = Annotated[str, BeforeValidator(_checked)]
+"""Field type of a size as people write it; empty: none."""

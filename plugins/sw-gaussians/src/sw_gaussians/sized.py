@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar, runtime_checkable
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
-from splatwizard_core.api import ConfigError, UserInputError
-from sw_gaussians.byte_sizes import parse_size
+from splatwizard_core.api import ConfigError
+from sw_gaussians.byte_sizes import ByteSize, parse_size
 from sw_gaussians.choices import CodecChoice
 from sw_gaussians.density.adc import GradientSettings
 from sw_gaussians.density.choice import DensityChoice
@@ -41,18 +41,7 @@ class Sized(Exchangeable):
 
     ENCODING = ("codec", "size")
 
-    size: str = Field("", description="bytes of the file, never more: 5MB; empty: as the codec's settings say")
-
-    @field_validator("size", mode="before")
-    @classmethod
-    def _is_size(cls, value: Any) -> str:
-        if value == "":
-            return ""
-        try:
-            parse_size(value)
-        except UserInputError:
-            raise ValueError("bytes, or a number with kB, MB, GB, KiB, MiB or GiB") from None
-        return str(value)
+    size: ByteSize = Field("", description="bytes of the file, never more: 5MB; empty: as the codec's settings say")
 
     def completed(self: SizedT, plugins: PluginManager, sources: Mapping[str, str]) -> SizedT:
         return super(Sized, self.model_copy(update=self.of_size(sources))).completed(plugins, sources)

@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatwizard_core.api import ConfigError, Method, SceneError
+import torch
+from sw_anchors.file_size import filling_factor
+
+from splatwizard_core.api import ConfigError, ContainerWriter, Method, SceneError
 from sw_hac_plus import codec
 from sw_hac_plus.channel_mixture import PARTS, ChannelMixture
 from sw_hac_plus.config import HACPlusConfig
@@ -15,9 +18,9 @@ from sw_hac_plus.stage import HACPlusStage
 from sw_hac_plus.voxel_lattice import check_reach
 
 if TYPE_CHECKING:
-    import torch
+    from sw_anchors.coded_anchors import CodedAnchors
 
-    from splatwizard_core.api import ContainerReader, ContainerWriter, Scene, SplatModel, Stage
+    from splatwizard_core.api import ContainerReader, Scene, SplatModel, Stage
 
 
 class HACPlus(Method):
@@ -67,12 +70,24 @@ class HACPlus(Method):
         )  # fmt: skip
 
     def stages(self) -> Sequence[Stage]:
-        return [HACPlusStage(self.config, pictures=self.config.pictures.load(self.plugins))]
+        return [HACPlusStage(self.config, pictures=self.config.pictures.load(self.plugins), file_bytes=self.file_bytes)]
+
+    def file_bytes(self, model: CodedAnchors) -> int:
+        """Bytes of the file that a model would have now, quantiser steps as they are."""
+        assert isinstance(model, HACPlusAnchors)
+        writer = ContainerWriter(self.name, self.version)
+        with torch.no_grad():
+            codec.encode(model, writer, self.config.codec.settings, self.plugins)
+        return len(writer.to_bytes())
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         if not isinstance(model, HACPlusAnchors):
             raise TypeError(f"hac-plus encodes its own anchors, not a {type(model).__name__}")
-        codec.encode(model, writer, self.config.codec.settings, self.plugins)
+
+        def write(file: ContainerWriter, factor: float) -> None:
+            codec.encode(model, file, self.config.codec.settings, self.plugins, factor)
+
+        write(writer, filling_factor(write, writer, self.config.size))
 
     def decode(self, reader: ContainerReader) -> SplatModel:
         self.check_version(reader)

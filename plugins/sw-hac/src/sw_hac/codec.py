@@ -52,9 +52,11 @@ LIMITS = {"feature_dim": 256, "hidden": 256, "grid_hidden": 256, "grid_features"
 """Largest value of a size in the header."""
 
 
-def encode(model: HACAnchors, writer: ContainerWriter, settings: FileSettings, plugins: PluginManager) -> None:
-    """Write all sections; the model stays as it is."""
-    model = settled_copy(model, settings.weights)
+def encode(
+    model: HACAnchors, writer: ContainerWriter, settings: FileSettings, plugins: PluginManager, factor: float = 1.0
+) -> None:
+    """Write all sections, quantiser steps multiplied by `factor`; the model stays as it is."""
+    model = settled_copy(model, settings.weights, factor)
     geometry, rows = kept_geometry(model)
     add_header(model, writer, settings.mode)
     add_geometry(writer, geometry, plugins)
@@ -97,14 +99,20 @@ class HACHeader:
     grid_features: int
 
 
-def settled_copy(model: Model, weights: WeightType) -> Model:
-    """Return a copy on the CPU whose networks predict in the units of the values, with the weights of the file."""
+def settled_copy(model: Model, weights: WeightType, factor: float = 1.0, *, learned_steps: bool = False) -> Model:
+    """Return a copy on the CPU whose networks predict in the units of the values, with the weights of the file.
+
+    factor          on the base steps
+    learned_steps   leaves that of the features: a network has learnt to read them in it
+    """
     if model.phase != ENTROPY:
         log.warning(
             "the model was never trained for its rate (phase '%s'): its file will be large and inexact", model.phase
         )
     model = copy.deepcopy(model).to("cpu").eval()
     model.fold_units()
+    features, scales, offsets = model.base_steps
+    model.base_steps = (features if learned_steps else factor * features), factor * scales, factor * offsets
     round_networks(model.networks(), weights)
     return model
 

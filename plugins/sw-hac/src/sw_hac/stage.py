@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sw_anchors.coded_anchors import ENTROPY, QUANTIZED
+from sw_anchors.file_size import SizeControl
 from sw_anchors.phase_switch import PhaseSwitch
 from sw_anchors.rate_model import AnchorRate
 from sw_anchors.stage import CodedAnchorStage, Weighted
@@ -13,7 +14,10 @@ from sw_hac.config import HACParams
 from sw_hac.model import HACAnchors
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
+
+    from sw_anchors.coded_anchors import CodedAnchors
+    from sw_gaussians.pictures import PictureSizes
 
     from splatwizard_core.api import OptimizationParams, PipelineParams, RenderResult, Scheduler
 
@@ -26,6 +30,14 @@ class HACStage(CodedAnchorStage):
 
     name = "hac"
     opt: HACParams
+
+    def __init__(
+        self, opt: HACParams, *, pictures: PictureSizes | None = None,
+        file_bytes: Callable[[CodedAnchors], int] | None = None,
+    ) -> None:  # fmt: skip
+        """Set up like AnchorStage; file_bytes: of the file that a model would have, for trainings to a size."""
+        super().__init__(opt, pictures=pictures)
+        self._file_bytes = file_bytes
 
     def learning_rates(self, step: int) -> Mapping[str, float]:
         lr = self.opt.lr
@@ -43,6 +55,9 @@ class HACStage(CodedAnchorStage):
         PhaseSwitch(self.at(phases.entropy), ENTROPY).register(scheduler)
         if self.opt.rate_term.start == "statistics":
             scheduler.register_task(self.at(phases.entropy), self.start_from_statistics)
+        if self.opt.size and self._file_bytes is not None:
+            steps, first = self.opt.iterations, self.at(phases.entropy)
+            SizeControl(self.opt.size, self._file_bytes, first=first, steps=steps).register(scheduler)
 
     def start_from_statistics(self, model: HACAnchors) -> None:
         """Start the network behind the grid at mean and deviation of the values, see the model's method."""
@@ -61,9 +76,10 @@ class HACStage(CodedAnchorStage):
         if rate is None:
             return {}
         assert rate.own_bits is not None
-        weights = self.opt.rate_term
+        weights, factor = self.opt.rate_term, model.size_control.get("factor", 1.0)
+        weight, masks = factor * weights.weight, factor * weights.masks
         terms = {
-            "rate": (weights.weight, rate.bits),
-            "grid": (weights.weight / max(model.num_rows * sum(model.shape.widths), 1), rate.own_bits),
+            "rate": (weight, rate.bits),
+            "grid": (weight / max(model.num_rows * sum(model.shape.widths), 1), rate.own_bits),
         }
-        return {**terms, "masks": (weights.masks, model.soft_masks().mean())} if weights.masks else terms
+        return {**terms, "masks": (masks, model.soft_masks().mean())} if masks else terms
