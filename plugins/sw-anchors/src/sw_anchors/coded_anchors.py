@@ -51,19 +51,10 @@ class CodedAnchors(AnchorModel):
     bounds: Tensor
 
     def __init__(
-        self,
-        anchors: Tensor,
-        features: Tensor,
-        offsets: Tensor,
-        log_scales: Tensor,
-        *,
-        margin: Margin = "none",
-        base_steps: tuple[float, float, float] = (1.0, 0.001, 0.2),
-        sample: float = 0.05,
-        smallest_probability: float = 1e-6,
-        scale_floor: float = 0.0,
-        **kwargs: Any,
-    ) -> None:
+        self, anchors: Tensor, features: Tensor, offsets: Tensor, log_scales: Tensor, *, margin: Margin = "none",
+        base_steps: tuple[float, float, float] = (1.0, 0.001, 0.2), sample: float = 0.05,
+        smallest_probability: float = 1e-6, scale_floor: float = 0.0, **kwargs: Any,
+    ) -> None:  # fmt: skip
         """Initialise like AnchorModel, which gets `kwargs`.
 
         margin          of the bounds, see `lattice.bounds_of`
@@ -80,7 +71,7 @@ class CodedAnchors(AnchorModel):
         self.base_steps = base_steps
         self.sample, self.smallest_probability = sample, smallest_probability
         self.scale_floor = scale_floor
-        self.size_control: dict[str, float] = {}  # state of `file_size.SizeControl`
+        self.led: dict[str, Any] = {}  # by a task that leads the training to a size: "factor" of lambda, "steps"
         self._lattice: tuple[tuple[Any, ...], Tensor, Tensor] | None = None
         self._steps: dict[tuple[Any, ...], Tensor] = {}
 
@@ -288,10 +279,8 @@ class CodedAnchors(AnchorModel):
         return found
 
     def state_dict_extra(self) -> dict[str, Any]:
-        controlled = {"size_control": dict(self.size_control)} if self.size_control else {}
-        return {**super().state_dict_extra(), "phase": self.phase, **controlled}
+        return {**super().state_dict_extra(), "phase": self.phase, **({"led": dict(self.led)} if self.led else {})}
 
     def load_state_dict_extra(self, extra: dict[str, Any]) -> None:
         super().load_state_dict_extra(extra)
-        self.phase = str(extra["phase"])
-        self.size_control = dict(extra.get("size_control", {}))
+        self.phase, self.led = str(extra["phase"]), dict(extra.get("led", {}))

@@ -36,11 +36,9 @@ AFTER_FEATURES = {"scales": "scalings", "offsets": "offsets"}
 """Section of each group that is coded after the features, under one Gaussian."""
 
 
-def encode(
-    model: HACPlusAnchors, writer: ContainerWriter, settings: FileSettings, plugins: PluginManager, factor: float = 1.0
-) -> None:
-    """Write all sections, quantiser steps multiplied by `factor`; the model stays as it is."""
-    model = hac_codec.settled_copy(model, settings.weights, factor, learned_steps=model.channel is not None)
+def encode(model: HACPlusAnchors, writer: ContainerWriter, settings: FileSettings, plugins: PluginManager) -> None:
+    """Write all sections; the model stays as it is."""
+    model = hac_codec.settled_copy(model, settings.weights)
     geometry, rows = kept_voxels(model)
     hac_codec.add_header(model, writer, settings.mode)
     _add_channel(writer, model.channel)

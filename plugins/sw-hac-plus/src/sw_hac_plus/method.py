@@ -5,10 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import torch
-from sw_anchors.file_size import filling_factor
-
-from splatwizard_core.api import ConfigError, ContainerWriter, Method, SceneError
+from splatwizard_core.api import ConfigError, Method, SceneError
 from sw_hac_plus import codec
 from sw_hac_plus.channel_mixture import PARTS, ChannelMixture
 from sw_hac_plus.config import HACPlusConfig
@@ -18,9 +15,9 @@ from sw_hac_plus.stage import HACPlusStage
 from sw_hac_plus.voxel_lattice import check_reach
 
 if TYPE_CHECKING:
-    from sw_anchors.coded_anchors import CodedAnchors
+    import torch
 
-    from splatwizard_core.api import ContainerReader, Scene, SplatModel, Stage
+    from splatwizard_core.api import ContainerReader, ContainerWriter, Scene, SplatModel, Stage
 
 
 class HACPlus(Method):
@@ -70,24 +67,16 @@ class HACPlus(Method):
         )  # fmt: skip
 
     def stages(self) -> Sequence[Stage]:
-        return [HACPlusStage(self.config, pictures=self.config.pictures.load(self.plugins), file_bytes=self.file_bytes)]
-
-    def file_bytes(self, model: CodedAnchors) -> int:
-        """Bytes of the file that a model would have now, quantiser steps as they are."""
-        assert isinstance(model, HACPlusAnchors)
-        writer = ContainerWriter(self.name, self.version)
-        with torch.no_grad():
-            codec.encode(model, writer, self.config.codec.settings, self.plugins)
-        return len(writer.to_bytes())
+        stage = HACPlusStage(self.config, pictures=self.config.pictures.load(self.plugins))
+        if self.config.size:
+            lead, first = self.plugins.tasks.load("lead-to-size"), stage.at(self.config.phases.entropy)
+            stage.leading = lead(self.config.size, self.name, first, stage.iterations)
+        return [stage]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         if not isinstance(model, HACPlusAnchors):
             raise TypeError(f"hac-plus encodes its own anchors, not a {type(model).__name__}")
-
-        def write(file: ContainerWriter, factor: float) -> None:
-            codec.encode(model, file, self.config.codec.settings, self.plugins, factor)
-
-        write(writer, filling_factor(write, writer, self.config.size))
+        codec.encode(model, writer, self.config.codec.settings, self.plugins)
 
     def decode(self, reader: ContainerReader) -> SplatModel:
         self.check_version(reader)

@@ -52,11 +52,9 @@ LIMITS = {"feature_dim": 256, "hidden": 256, "grid_hidden": 256, "grid_features"
 """Largest value of a size in the header."""
 
 
-def encode(
-    model: HACAnchors, writer: ContainerWriter, settings: FileSettings, plugins: PluginManager, factor: float = 1.0
-) -> None:
-    """Write all sections, quantiser steps multiplied by `factor`; the model stays as it is."""
-    model = settled_copy(model, settings.weights, factor)
+def encode(model: HACAnchors, writer: ContainerWriter, settings: FileSettings, plugins: PluginManager) -> None:
+    """Write all sections; the model stays as it is."""
+    model = settled_copy(model, settings.weights)
     geometry, rows = kept_geometry(model)
     add_header(model, writer, settings.mode)
     add_geometry(writer, geometry, plugins)
@@ -99,20 +97,16 @@ class HACHeader:
     grid_features: int
 
 
-def settled_copy(model: Model, weights: WeightType, factor: float = 1.0, *, learned_steps: bool = False) -> Model:
-    """Return a copy on the CPU whose networks predict in the units of the values, with the weights of the file.
-
-    factor          on the base steps
-    learned_steps   leaves that of the features: a network has learnt to read them in it
-    """
+def settled_copy(model: Model, weights: WeightType) -> Model:
+    """Return a copy on the CPU whose networks predict in the units of the values, with the weights of the file."""
     if model.phase != ENTROPY:
         log.warning(
             "the model was never trained for its rate (phase '%s'): its file will be large and inexact", model.phase
         )
     model = copy.deepcopy(model).to("cpu").eval()
     model.fold_units()
-    features, scales, offsets = model.base_steps
-    model.base_steps = (features if learned_steps else factor * features), factor * scales, factor * offsets
+    base, factors = model.base_steps, model.led.get("steps", (1, 1, 1))
+    model.base_steps = base[0] * factors[0], base[1] * factors[1], base[2] * factors[2]
     round_networks(model.networks(), weights)
     return model
 
@@ -165,10 +159,7 @@ def read_grid(reader: ContainerReader, features: int, plugins: PluginManager) ->
 
 
 def walk(
-    attributes: AttributeCoder,
-    predictor: Predictor,
-    geometry: AnchorGeometry,
-    sections: Mapping[str, str] = SECTIONS,
+    attributes: AttributeCoder, predictor: Predictor, geometry: AnchorGeometry, sections: Mapping[str, str] = SECTIONS
 ) -> None:
     """Code all groups of each block of anchors: encoder and decoder go over them in this order.
 

@@ -6,7 +6,6 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 from sw_anchors.lattice import Margin
 from sw_anchors.params import CodedAnchorLearningRates, CodedAnchorParams
-from sw_gaussians.byte_sizes import ByteSize
 from sw_gaussians.named_blocks import SWITCH, Choosing, Moved, OwnCodec
 
 from splatwizard_core.api import Params
@@ -112,9 +111,7 @@ class HACParams(CodedAnchorParams):
     phases: Phases = Field(Phases(), description="when training turns to noise, and to a rate")
     rate_term: RateTerm = Field(RateTerm(), description="rate term of the loss")
     steps: Steps = Field(Steps(), description="quantiser steps before they are predicted")
-    size: ByteSize = Field(
-        "", description="bytes of the file, never more: 5MB; lambda is led to it; empty: as lambda has it"
-    )
+    size: str = Field("", description="bytes of the file at most: 5MB; lambda is led to it; empty: as lambda has it")
 
     @property
     def margin(self) -> Margin:

@@ -5,10 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import torch
-from sw_anchors.file_size import filling_factor
-
-from splatwizard_core.api import ContainerWriter, Method
+from splatwizard_core.api import Method
 from sw_hac import codec
 from sw_hac.config import HACConfig
 from sw_hac.model import HACAnchors
@@ -16,9 +13,9 @@ from sw_hac.presets import BY_DATASET, PRESETS, RATES
 from sw_hac.stage import HACStage
 
 if TYPE_CHECKING:
-    from sw_anchors.coded_anchors import CodedAnchors
+    import torch
 
-    from splatwizard_core.api import ContainerReader, Scene, SplatModel, Stage
+    from splatwizard_core.api import ContainerReader, ContainerWriter, Scene, SplatModel, Stage
 
 
 class HAC(Method):
@@ -40,24 +37,16 @@ class HAC(Method):
         return HACAnchors.of_scene(scene, self.config, generator)
 
     def stages(self) -> Sequence[Stage]:
-        return [HACStage(self.config, pictures=self.config.pictures.load(self.plugins), file_bytes=self.file_bytes)]
-
-    def file_bytes(self, model: CodedAnchors) -> int:
-        """Bytes of the file that a model would have now, quantiser steps as they are."""
-        assert isinstance(model, HACAnchors)
-        writer = ContainerWriter(self.name, self.version)
-        with torch.no_grad():
-            codec.encode(model, writer, self.config.codec.settings, self.plugins)
-        return len(writer.to_bytes())
+        stage = HACStage(self.config, pictures=self.config.pictures.load(self.plugins))
+        if self.config.size:
+            lead, first = self.plugins.tasks.load("lead-to-size"), stage.at(self.config.phases.entropy)
+            stage.leading = lead(self.config.size, self.name, first, stage.iterations)
+        return [stage]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         if not isinstance(model, HACAnchors):
             raise TypeError(f"hac encodes its own anchors, not a {type(model).__name__}")
-
-        def write(file: ContainerWriter, factor: float) -> None:
-            codec.encode(model, file, self.config.codec.settings, self.plugins, factor)
-
-        write(writer, filling_factor(write, writer, self.config.size))
+        codec.encode(model, writer, self.config.codec.settings, self.plugins)
 
     def decode(self, reader: ContainerReader) -> SplatModel:
         self.check_version(reader)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from sw_anchors.coded_anchors import ENTROPY, QUANTIZED
-from sw_anchors.file_size import SizeControl
 from sw_anchors.phase_switch import PhaseSwitch
 from sw_anchors.rate_model import AnchorRate
 from sw_anchors.stage import CodedAnchorStage, Weighted
@@ -14,10 +13,7 @@ from sw_hac.config import HACParams
 from sw_hac.model import HACAnchors
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from sw_anchors.coded_anchors import CodedAnchors
-    from sw_gaussians.pictures import PictureSizes
+    from collections.abc import Mapping
 
     from splatwizard_core.api import OptimizationParams, PipelineParams, RenderResult, Scheduler
 
@@ -30,14 +26,7 @@ class HACStage(CodedAnchorStage):
 
     name = "hac"
     opt: HACParams
-
-    def __init__(
-        self, opt: HACParams, *, pictures: PictureSizes | None = None,
-        file_bytes: Callable[[CodedAnchors], int] | None = None,
-    ) -> None:  # fmt: skip
-        """Set up like AnchorStage; file_bytes: of the file that a model would have, for trainings to a size."""
-        super().__init__(opt, pictures=pictures)
-        self._file_bytes = file_bytes
+    leading: Any = None  # task of a training to a size, with its `steps`
 
     def learning_rates(self, step: int) -> Mapping[str, float]:
         lr = self.opt.lr
@@ -55,9 +44,8 @@ class HACStage(CodedAnchorStage):
         PhaseSwitch(self.at(phases.entropy), ENTROPY).register(scheduler)
         if self.opt.rate_term.start == "statistics":
             scheduler.register_task(self.at(phases.entropy), self.start_from_statistics)
-        if self.opt.size and self._file_bytes is not None:
-            steps, first = self.opt.iterations, self.at(phases.entropy)
-            SizeControl(self.opt.size, self._file_bytes, first=first, steps=steps).register(scheduler)
+        if self.leading is not None:
+            scheduler.register_task(self.leading.steps, self.leading, name="lead lambda to the size")
 
     def start_from_statistics(self, model: HACAnchors) -> None:
         """Start the network behind the grid at mean and deviation of the values, see the model's method."""
@@ -76,8 +64,8 @@ class HACStage(CodedAnchorStage):
         if rate is None:
             return {}
         assert rate.own_bits is not None
-        weights, factor = self.opt.rate_term, model.size_control.get("factor", 1.0)
-        weight, masks = factor * weights.weight, factor * weights.masks
+        factor: float = model.led.get("factor", 1.0)
+        weight, masks = factor * self.opt.rate_term.weight, factor * self.opt.rate_term.masks
         terms = {
             "rate": (weight, rate.bits),
             "grid": (weight / max(model.num_rows * sum(model.shape.widths), 1), rate.own_bits),
