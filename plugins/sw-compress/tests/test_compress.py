@@ -171,12 +171,12 @@ def test_the_number_and_the_degree_may_be_given(source):
 
 
 def test_a_refined_file_has_its_size_and_is_no_worse(ball):
-    done = compress(ball(200), size="2500", views=9, device="cpu", refine=1.0)
+    done = compress(ball(200), size="2500", views=9, device="cpu", refine=0.3)
     assert 0.99 * 2_500 < done.record["bytes"] <= 2_500
     told = done.record["refined"]
     assert told["steps"] > 0
     assert told["psnr_after"] >= told["psnr_before"]
-    assert done.record["seconds"]["refine"] >= 1
+    assert done.record["seconds"]["refine"] >= 0.3
 
 
 def test_several_files_of_which_some_fail(source, tmp_path):

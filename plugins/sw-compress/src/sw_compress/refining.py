@@ -84,9 +84,9 @@ def refine(
     optimizer = torch.optim.Adam([{"params": [each]} for each in params.values()], eps=1e-15)
     steps, judged, options = 0, 0, RasterOptions()
     with track("refine", total=JUDGEMENTS) as bar:
-        while (share := (clock() - began) / seconds) < 1:
+        while (share := (clock() - began) / seconds) < 1 or not steps:
             for group, rate in zip(optimizer.param_groups, usual, strict=True):
-                group["lr"] = rate * FALL[0] * (FALL[1] / FALL[0]) ** share
+                group["lr"] = rate * FALL[0] * (FALL[1] / FALL[0]) ** min(share, 1.0)
             i = int(torch.randint(len(teaching), (), generator=draws))
             camera = near(teaching[i], centre.cpu(), draws).to(model.device)
             with torch.no_grad():
