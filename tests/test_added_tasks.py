@@ -18,9 +18,12 @@ from splatwizard_core.training.state import TrainingState
 NEEDED = {
     "average-parameters": {"first": 10, "last": 30},
     "dash": {"full_at": 20},
+    "lead-to-size": {"size": "1MB", "method": "hac", "first": 10, "last": 90},
     "settle-learning-rates": {"rates": {"means": 1e-3}, "first": 10, "last": 20},
 }
 """Settings without a default."""
+OTHER_MODELS = {"mask-prune": "VolumeMaskedGaussians", "lead-to-size": "CodedAnchors"}
+"""Tasks for models of one family."""
 TASKS = [entry.name for entry in load_plugins().tasks if is_ours(entry.distribution)]
 
 
@@ -43,8 +46,8 @@ def test_it_is_in_the_plan_of_a_stage_that_knows_nothing_of_it(name):
         """Raise TaskSignatureError unless everything that a task asks for is there."""
         TrainingState.begin(stage, model, scene, PipelineParams(), ReferenceRasterizer(), Streams(0))
 
-    if name == "mask-prune":
-        with pytest.raises(TaskSignatureError, match="wants VolumeMaskedGaussians, this run has GaussianModel"):
+    if name in OTHER_MODELS:
+        with pytest.raises(TaskSignatureError, match=f"wants {OTHER_MODELS[name]}, this run has GaussianModel"):
             begin()
     else:
         begin()

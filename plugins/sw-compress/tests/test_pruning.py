@@ -66,6 +66,13 @@ def test_what_no_camera_shows_stays(model: GaussianModel):
     assert len(Pruning(far, CAMERAS, RASTERIZER, keeps_unseen=False).rows(10)) == 10
 
 
+def test_what_no_camera_shows_goes_first_where_it_may(model: GaussianModel):
+    far = select(model, torch.arange(200))
+    far.means[:80, 0] += 500.0
+    pruning = Pruning(far, CAMERAS, RASTERIZER, keeps_unseen=False)
+    assert pruning.rows(120).tolist() == list(range(80, 200))
+
+
 def test_a_round_takes_few_and_few_neighbours(model: GaussianModel):
     pruning = Pruning(model, CAMERAS, RASTERIZER, keeps_unseen=False)
     pruning.rows(199)

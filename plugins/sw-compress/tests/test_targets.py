@@ -1,7 +1,8 @@
 """Sizes, qualities and ratios as people write them, and as they should not."""
 
 import pytest
-from sw_compress.targets import Target, parse_quality, parse_size
+from sw_compress.targets import Target, parse_quality
+from sw_gaussians.byte_sizes import parse_size
 
 from splatwizard_core.api import UserInputError
 

@@ -11,10 +11,12 @@ from hypothesis import strategies as st
 from sw_anchors.sections import BOUNDS_BYTES
 from sw_anchors.shape import GROUPS
 from sw_anchors.testing import check_without_kernels
+from sw_compress.lambda_control import LeadToSize
 from sw_kit.forged_files import forged
 from sw_reference.rasterizer import ReferenceRasterizer
 from sw_reference.testing.raster_scenes import front_camera
 
+from splatwizard_core.api import TaskLog
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import BitstreamError, SceneError
 from splatwizard_core.rendering.rasterizer import RasterOptions
@@ -270,3 +272,16 @@ def test_the_order_of_the_models_anchors_is_no_matter():
         for name in ("anchors", "features", "offsets", "log_scales", "mask_logits"):
             getattr(shuffled, name).copy_(getattr(model, name)[order])
     assert encoded(shuffled) == encoded(model)
+
+
+@pytest.mark.parametrize("kind", ["full", "none"])
+def test_a_file_of_a_size_decodes(kind):
+    """Features keep their step where a network has learnt to read them in it."""
+    model = make(n=2000, channel__kind=kind)
+    size = int(0.95 * len(encoded(model, channel__kind=kind)))
+    LeadToSize(str(size), "hac-plus", 10, 20)(model, method(channel__kind=kind).config, 20, TaskLog())
+    data = encoded(model, channel__kind=kind)
+    assert 0.96 * size - 1_000 < len(data) <= size
+    steps = ContainerReader(data).static["base_steps"]
+    assert [a > b for a, b in zip(steps, model.base_steps, strict=True)] == [kind == "none", True, True]
+    assert decoded(data).num_rows == int(model.kept().sum())

@@ -43,6 +43,7 @@ class Method:
     def __init__(self, plugins: PluginManager, config: OptimizationParams | None) -> None:
         """config is None when decoding: the file is all there is."""
         self.plugins = plugins
+        self.scene: Scene | None = None  # that a model was trained on, while it is encoded
         self._config = config
 
     @property

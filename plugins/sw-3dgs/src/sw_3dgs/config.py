@@ -7,6 +7,7 @@ from pydantic import Field
 from sw_gaussians.choices import CodecChoice, Moved
 from sw_gaussians.config import GaussianTraining
 from sw_gaussians.fast.fused_adam import MIN_FUSED_GAUSSIANS
+from sw_gaussians.sized import Capped
 
 from splatwizard_core.api import InputFile
 from sw_codecs.models.settings import QuantizedSettings
@@ -15,7 +16,7 @@ MODES = {"exact": "gaussians-exact", "quantized": "gaussians-quantized"}
 """Header value `mode` of a file (and `codec.mode` of 0.1 configs) -> codec."""
 
 
-class ThreeDGSConfig(GaussianTraining):
+class ThreeDGSConfig(Capped, GaussianTraining):
     """Configuration of 3DGS."""
 
     OLDER: ClassVar[Mapping[str, Moved]] = {

@@ -10,6 +10,7 @@ from sw_gaussians.choices import Choosing, CodecChoice, PrunerChoice
 from sw_gaussians.finetune.fine_tuning import FineTuningRates, FineTuningStage, collect_anew, windows_before
 from sw_gaussians.finetune.pruning import PruneByScore, PruneToCount
 from sw_gaussians.method import GaussianMethod
+from sw_gaussians.sized import Sized
 
 if TYPE_CHECKING:
     from splatwizard_core.api import OptimizationParams, PipelineParams, PluginManager, Scheduler, Stage
@@ -37,7 +38,7 @@ class Rates(FineTuningRates):
     decay: float = Field(0.912, gt=0, le=1, description="factor on all rates but that of the means, again and again")
 
 
-class Pruned3DGSConfig(Choosing):
+class Pruned3DGSConfig(Sized, Choosing):
     """Everything that can be set for pruned-3dgs."""
 
     FULL_ITERATIONS: ClassVar[int] = 10_000

@@ -51,19 +51,10 @@ class CodedAnchors(AnchorModel):
     bounds: Tensor
 
     def __init__(
-        self,
-        anchors: Tensor,
-        features: Tensor,
-        offsets: Tensor,
-        log_scales: Tensor,
-        *,
-        margin: Margin = "none",
-        base_steps: tuple[float, float, float] = (1.0, 0.001, 0.2),
-        sample: float = 0.05,
-        smallest_probability: float = 1e-6,
-        scale_floor: float = 0.0,
-        **kwargs: Any,
-    ) -> None:
+        self, anchors: Tensor, features: Tensor, offsets: Tensor, log_scales: Tensor, *, margin: Margin = "none",
+        base_steps: tuple[float, float, float] = (1.0, 0.001, 0.2), sample: float = 0.05,
+        smallest_probability: float = 1e-6, scale_floor: float = 0.0, **kwargs: Any,
+    ) -> None:  # fmt: skip
         """Initialise like AnchorModel, which gets `kwargs`.
 
         margin          of the bounds, see `lattice.bounds_of`
@@ -80,6 +71,7 @@ class CodedAnchors(AnchorModel):
         self.base_steps = base_steps
         self.sample, self.smallest_probability = sample, smallest_probability
         self.scale_floor = scale_floor
+        self.led: dict[str, Any] = {}  # by a task that leads the training to a size: "factor" of lambda, "steps"
         self._lattice: tuple[tuple[Any, ...], Tensor, Tensor] | None = None
         self._steps: dict[tuple[Any, ...], Tensor] = {}
 
@@ -177,9 +169,9 @@ class CodedAnchors(AnchorModel):
             return self._rounded(rows)
         rate: dict[str, AnchorRate] = {}
         if self.phase == FULL:
-            values = self._values(rows, None)
+            values = self.noisy(rows, None)
         elif self.phase == QUANTIZED:
-            values = self._values(rows, Noise(self.noise_steps(self.features), self._draw_noise(rows)))
+            values = self.noisy(rows, Noise(self.noise_steps(self.features), self._draw_noise(rows)))
         elif self.RATE_OF == "visible":
             values, rate["rate"] = self._with_rate_of_visible(rows)
         else:
@@ -195,7 +187,7 @@ class CodedAnchors(AnchorModel):
         """
         uniform, drawn = self._draw_noise(rows), self.draw_sample(len(rows))
         forecast = self.rate_model.forecast(self.context_of(rows), drawn)
-        values = self._values(rows, Noise(forecast.steps, uniform), drawn)
+        values = self.noisy(rows, Noise(forecast.steps, uniform), drawn)
         kept = values.masks.detach().amax(dim=1)
         counted, masks = kept.index_select(0, drawn), values.masks.index_select(0, drawn)
         bits, by_group = self.rate_model.rate(values.sample, forecast, masks, counted)
@@ -207,14 +199,14 @@ class CodedAnchors(AnchorModel):
         drawn = self.draw_sample(self.num_rows)
         sample = slice(len(rows), None)
         forecast = self.rate_model.forecast(self.context_of(torch.cat([rows, drawn])), sample)
-        values = self._values(rows, Noise(forecast.steps[: len(rows)], self._draw_noise(rows)))
+        values = self.noisy(rows, Noise(forecast.steps[: len(rows)], self._draw_noise(rows)))
         every = torch.arange(len(drawn), device=self.device)
-        own = self._values(drawn, Noise(forecast.sample_steps, self._draw_noise(drawn)), every)
+        own = self.noisy(drawn, Noise(forecast.sample_steps, self._draw_noise(drawn)), every)
         counted = own.sample.new_ones(len(drawn))
         bits, by_group = self.rate_model.rate(own.sample, forecast, own.masks, counted)
         return values, AnchorRate.of(bits, by_group, counted.sum() * own.sample.shape[1], forecast)
 
-    def _values(self, rows: Tensor, noise: Noise | None, drawn: Tensor | None = None) -> NoisyValues:
+    def noisy(self, rows: Tensor, noise: Noise | None, drawn: Tensor | None = None) -> NoisyValues:
         """Return values of the anchors `rows`; `sample` holds those at the positions `drawn` in it."""
         tables, weights = self._tables, self.mask_weights()
         compute = fast_values.noisy_values if fast_values.fits(tables, weights) else noisy_values
@@ -287,8 +279,8 @@ class CodedAnchors(AnchorModel):
         return found
 
     def state_dict_extra(self) -> dict[str, Any]:
-        return {**super().state_dict_extra(), "phase": self.phase}
+        return {**super().state_dict_extra(), "phase": self.phase, **({"led": dict(self.led)} if self.led else {})}
 
     def load_state_dict_extra(self, extra: dict[str, Any]) -> None:
         super().load_state_dict_extra(extra)
-        self.phase = str(extra["phase"])
+        self.phase, self.led = str(extra["phase"]), dict(extra.get("led", {}))

@@ -145,15 +145,9 @@ def gaussian_rate(
 
 
 def bits_of(
-    values: Tensor,
-    mean: Tensor,
-    scale: Tensor,
-    steps: Tensor,
-    masks: Tensor,
-    counted: Tensor,
-    smallest: float,
+    values: Tensor, mean: Tensor, scale: Tensor, steps: Tensor, masks: Tensor, counted: Tensor, smallest: float,
     smallest_scale: float,
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Return what `gaussian_rate` returns.
 
     smallest        probability of a value

@@ -74,6 +74,31 @@ def within(curves: Sequence[Curve], budget: float) -> Allocation | None:
     return best
 
 
+def of_error(curves: Sequence[Curve], error: float) -> Allocation:
+    """The cheapest levels whose error is at most `error`, or the finest."""
+    best: Allocation | None = None
+    for fixed in _fixed(curves):
+        if sum(float(curve.error[0]) for curve in fixed) > error:
+            continue
+        found = _bisected_error(fixed, error)
+        if best is None or found.bytes < best.bytes:
+            best = found
+    return best or _at(curves, [0] * len(curves))
+
+
+def _bisected_error(curves: Sequence[Curve], error: float) -> Allocation:
+    low, high = -60.0, 20.0
+    best = _at(curves, [0] * len(curves))
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        found = at_price(curves, float(np.exp(middle)))
+        if found.error > error:
+            high = middle
+        else:
+            low, best = middle, found
+    return best
+
+
 def _fixed(curves: Sequence[Curve]) -> Iterator[list[Curve]]:
     """The curves with each level of the first that has no levels between; these make a step in the bytes."""
     whole = next((i for i, curve in enumerate(curves) if curve.whole), None)

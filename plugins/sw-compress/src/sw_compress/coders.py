@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from sw_gaussians.choices import CodecChoice
 
 from splatwizard_core.api import GaussianModel, create_method
 from splatwizard_core.tooling import encode as encode_model
@@ -47,13 +48,17 @@ FIXED_BYTES = 1100
 
 @dataclass(frozen=True)
 class Quantized:
-    """Writes `.swz` files of the method `3dgs`.
+    """Writes `.swz` files.
 
     raster      what the file asks of a renderer
+    method      that the file is of: one of explicit Gaussians
+    origin      of the model in the world; None: its own
     """
 
     plugins: PluginManager
     raster: Mapping[str, Any]
+    method: str = "3dgs"
+    origin: tuple[float, float, float] | None = None
 
     def attributes(self, model: GaussianModel) -> tuple[str, ...]:
         """Names of what has a level."""
@@ -67,8 +72,12 @@ class Quantized:
 
     def settings(self, levels: Levels) -> QuantizedSettings:
         """Settings of the codec."""
-        steps = {f"{name}_step": STEPS[name] * 2.0 ** levels.get(name, 0.0) for name in STEPS}
+        steps = {f"{name}_step": step for name, step in self.steps(levels).items()}
         return QuantizedSettings(position_bits=int(POSITION_BITS - levels[POSITIONS]), **steps)
+
+    def steps(self, levels: Levels) -> dict[str, float]:
+        """Quantiser steps by attribute, of all but the positions."""
+        return {name: step * 2.0 ** levels.get(name, 0.0) for name, step in STEPS.items()}
 
     def finest(self, model: GaussianModel) -> dict[str, float]:
         """Levels at which nothing is lost that could be seen."""
@@ -105,11 +114,17 @@ class Quantized:
 
     def encode(self, model: GaussianModel, levels: Levels, path: Path) -> int:
         """Write the file; return its bytes."""
-        settings = self.settings(levels).model_dump()
-        values = {f"codec.settings.{key}": value for key, value in settings.items() if not isinstance(value, str)}
-        method = create_method(self.plugins, "3dgs", {"codec.name": "gaussians-quantized", **values})
-        origin = model.world_origin or (0.0, 0.0, 0.0)
+        codec = self.choice(levels)
+        values = {"codec.name": codec.name, **{f"codec.settings.{key}": value for key, value in codec.settings.items()}}
+        method = create_method(self.plugins, self.method, values)
+        origin = self.origin or model.world_origin or (0.0, 0.0, 0.0)
         return encode_model(method, model, dict(self.raster), path, origin).bytes
+
+    def choice(self, levels: Levels) -> CodecChoice:
+        """The codec that writes the file, with its settings."""
+        settings = self.settings(levels).model_dump()
+        numbers = {key: value for key, value in settings.items() if not isinstance(value, str)}
+        return CodecChoice(name="gaussians-quantized", settings=numbers)
 
 
 def _bits(layout: quantized.Layout, symbols: NDArray[np.int32]) -> dict[str, float]:

@@ -2,28 +2,38 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from splatwizard_core.api import UserInputError
 from splatwizard_core.tooling import (
     EXISTING,
+    OUTPUT_FILE,
+    OUTPUT_FOLDER,
     ForeseenError,
     debug_option,
     device_option,
+    existing_file,
     json_option,
     options,
     print_facts,
     say,
 )
+from sw_compress.targets import Target
 
 if TYPE_CHECKING:
     from sw_compress.compressing import Compressed
 
+FORMATS = ("swz", "sog", "spz")
+"""Suffixes of what is written; the first is usual."""
+
 
 @click.command(short_help="any splat file to a size, without photographs")
-@click.argument("files", metavar="FILE...", nargs=-1, required=True, type=EXISTING)
+@click.argument("files", metavar="FILE...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @options(
     click.option("--size", metavar="SIZE",
                  help="Bytes of the result at most: 8MB, 8MiB, 800kB or a number.  [default: as --quality says]"),
@@ -32,23 +42,25 @@ if TYPE_CHECKING:
     click.option("--ratio", metavar="N", help="How many times smaller than the source.  [default: as --quality says]"),
     click.option("--out", metavar="PATH", type=click.Path(),
                  help="The file to write; of several files a folder.  [default: beside the source]"),
-    click.option("--format", "format_name", type=click.Choice(["swz", "sog", "spz"]),
+    click.option("--format", "format_name", type=click.Choice(FORMATS),
                  help="What is written: .swz is the smallest.  [default: by the suffix of --out, else swz]"),
     click.option("--cameras", type=EXISTING, metavar="FILE",
                  help="JSON of cameras (README of sw-view).  [default: they are made up]"),
     click.option("--views", type=click.IntRange(min=3), metavar="N",
                  help="Cameras that are made up, a third of them set aside.  [default: 18 to 120, by device and size]"),
     click.option("--gaussians", type=click.IntRange(min=1), metavar="N",
-                 help="Gaussians that stay.  [default: what gives the best picture]"),
+                 help="Gaussians that stay: the most significant ones.  [default: what gives the best picture]"),
     click.option("--sh-degree", type=click.IntRange(0, 3), metavar="D",
                  help="Highest degree of the spherical harmonics.  [default: the source's]"),
     click.option("--drop-unseen", is_flag=True, help="Let go what no camera shows."),
+    click.option("--refine", type=click.FloatRange(0, 86_400), default=0.0, metavar="SECONDS",
+                 help="Train what stays on pictures of the source for so long, .swz alone.  [default: 0, not]"),
     device_option, json_option, debug_option,
 )  # fmt: skip
 def compress(
     files: tuple[Path, ...], size: str | None, quality: str | None, ratio: str | None, out: str | None,
     format_name: str | None, cameras: Path | None, views: int | None, gaussians: int | None, sh_degree: int | None,
-    drop_unseen: bool, device: str | None, as_json: bool,
+    drop_unseen: bool, refine: float, device: str | None, as_json: bool,
 ) -> None:  # fmt: skip
     """Make FILE small without its photographs: fewer Gaussians, each as precise as its part in the picture asks for.
 
@@ -60,24 +72,29 @@ def compress(
     Of several files each is made to the same target; where one cannot be, the others are. A file that is already there
     is replaced only where --out names it.
     """
-    from sw_compress.compressing import compress as make
-    from sw_compress.source import default_output
-
+    # What can be said about the options is said before torch is loaded.
+    Target.of(size, quality, ratio, 0)
     format_name = _format(format_name, out if len(files) == 1 else None)
-    places = _places(files, out, f".{format_name}", default_output)
+    places = _places(files, out, f".{format_name}")
+    if len(files) == 1:
+        existing_file(files[0])
+    from sw_compress.compressing import compress as make
+
     records: list[dict[str, Any]] = []
     failed: list[ForeseenError] = []
     for file, place in zip(files, places, strict=True):
         try:
-            done = make(
-                file, size=size, quality=quality, ratio=ratio, out=place, format=format_name, cameras=cameras,
-                views=views, gaussians=gaussians, sh_degree=sh_degree, drop_unseen=drop_unseen,
-                device=device or "auto", say=say,
-            )  # fmt: skip
+            existing_file(file)
+            with _there(place.parent):
+                done = make(
+                    file, size=size, quality=quality, ratio=ratio, out=place, format=format_name, cameras=cameras,
+                    views=views, gaussians=gaussians, sh_degree=sh_degree, drop_unseen=drop_unseen, refine=refine,
+                    device=device or "auto", say=say,
+                )  # fmt: skip
         except ForeseenError as error:
             if len(files) == 1:
                 raise
-            say(f"{file}: {error}")
+            say(f"{'' if str(file) in str(error) else f'{file}: '}{error}")
             failed.append(error)
             continue
         records.append(done.record)
@@ -89,33 +106,38 @@ def compress(
         raise click.ClickException(f"{len(failed)} of {len(files)} files failed")
 
 
+@contextlib.contextmanager
+def _there(folder: Path) -> Iterator[None]:
+    """Make a folder for the block, and remove it again if nothing comes into it."""
+    made = [each for each in (folder, *folder.parents) if not each.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):  # there is something in it
+            for each in made:
+                each.rmdir()
+
+
 def _format(asked: str | None, out: str | None) -> str:
     """Return the format asked for, or that of the name of the result. Raises UserInputError where they differ."""
-    from splatwizard_core.api import UserInputError
-    from sw_compress.compressing import SWZ
-    from sw_compress.formats import FORMATS
-
     suffix = "" if out is None else Path(out).suffix.lower().removeprefix(".")
-    known = (SWZ, *FORMATS)
+    known = FORMATS
     if suffix and suffix not in ((asked,) if asked else known):
         which = asked or ", ".join(known)
-        raise UserInputError(f"{out}: a file of this name would hold {which}: give --out FILE.{asked or SWZ}")
-    return asked or suffix or SWZ
+        raise UserInputError(f"{out}: a file of this name would hold {which}: give --out FILE.{asked or FORMATS[0]}")
+    return asked or suffix or FORMATS[0]
 
 
-def _places(files: tuple[Path, ...], out: str | None, suffix: str, default: Any) -> list[Path]:
+def _places(files: tuple[Path, ...], out: str | None, suffix: str) -> list[Path]:
     """Return the place of each result. Raises UserInputError for one that is a source, that two share, or,
     where nobody named it, that is there."""
-    from splatwizard_core.api import UserInputError
-    from splatwizard_core.tooling import OUTPUT_FILE, OUTPUT_FOLDER
-
     if len(files) == 1:
-        places = [OUTPUT_FILE.check(out if out is not None else default(files[0], suffix))]
+        places = [OUTPUT_FILE.check(out if out is not None else default_output(files[0], suffix))]
     elif out is None:
-        places = [OUTPUT_FILE.check(default(file, suffix)) for file in files]
+        places = [OUTPUT_FILE.check(default_output(file, suffix)) for file in files]
     else:
         folder = OUTPUT_FOLDER.check(out)
-        folder.mkdir(parents=True, exist_ok=True)
         places = [folder / f"{file.stem}{suffix}" for file in files]
     sources = {file.resolve() for file in files}
     for place in places:
@@ -128,6 +150,12 @@ def _places(files: tuple[Path, ...], out: str | None, suffix: str, default: Any)
                 f"two results would be {place}: compress them one by one, or into folders of their own"
             )
     return places
+
+
+def default_output(path: Path, suffix: str) -> Path:
+    """Path beside the source with the suffix of the format."""
+    found = path.with_suffix(suffix)
+    return found if found != path else path.with_name(f"{path.stem}-small{suffix}")
 
 
 def _told(done: Compressed) -> str:

@@ -11,25 +11,25 @@ from typing import Any
 
 import torch
 
-from splatwizard_core.api import GaussianModel, PluginManager, RasterOptions, UserInputError, replacing
-from splatwizard_core.tooling import NegotiatedRasterizer, choose_device, load_plugins, open_model
+from splatwizard_core.api import Camera, GaussianModel, PluginManager, RasterOptions, UserInputError, replacing
+from splatwizard_core.tooling import OUTPUT_FILE, NegotiatedRasterizer, choose_device, load_plugins, open_model
 from sw_compress.coders import Quantized
+from sw_compress.filling import Filled, fill
 from sw_compress.formats import FORMATS, FormatFile, format_file
 from sw_compress.measuring import Errors
 from sw_compress.pruning import Pruning
 from sw_compress.quality import PHOTOGRAPHS, Pictures, loss_against_photographs, told_loss
+from sw_compress.refining import Refined, refine
 from sw_compress.rows import with_degree
-from sw_compress.search import Choice, Search, for_quality, for_size
+from sw_compress.search import Choice, Search, for_quality, measured_again
 from sw_compress.source import Source, open_source
 from sw_compress.stages import Stages, peak_bytes
-from sw_compress.targets import LEAST_SHARE, Target
-from sw_compress.views import views_of
+from sw_compress.targets import Target
+from sw_compress.views import made_up_views, views_of_file
 
 SWZ = "swz"
-MOST_ENCODES = 6
-"""Two are usual; a small file is in jumps."""
-AIM = 0.997
-"""Share of a target size that the second encode aims at."""
+LONGEST = 86_400
+"""Seconds that a refinement may take."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +61,7 @@ def compress(
     gaussians: int | None = None,
     sh_degree: int | None = None,
     drop_unseen: bool = False,
+    refine: float = 0.0,
     device: str = "auto",
     plugins: PluginManager | None = None,
     say: Callable[[str], None] = lambda line: None,
@@ -76,20 +77,29 @@ def compress(
     cameras     JSON of cameras in place of those made up
     views       number of cameras that are made up; None: 18 to 60 on a CPU, 48 to 120 on a GPU, more where there is
                 less to draw
-    gaussians   number that stays; None: what gives the best picture
+    gaussians   number that stays, the most significant ones; None: what gives the best picture
     sh_degree   highest degree of the spherical harmonics; None: the source's
-    drop_unseen whether what no camera shows may go
+    drop_unseen whether what no camera shows may go; it does where `gaussians` is given
+    refine      seconds of training on pictures of the source, for a .swz; 0: none
     say         takes lines for the user
 
-    Equal files, options and kind of device give equal bytes. Raises UserInputError for a target out of reach,
-    SceneError and BitstreamError for a source that cannot be used.
+    Equal files, options and kind of device give equal bytes, but for what `refine` makes in its time. Raises
+    UserInputError for a target out of reach, SceneError and BitstreamError for a source that cannot be used.
     """
-    stages, plugins = Stages(), load_plugins() if plugins is None else plugins
+    # What is wrong with what is asked for is told before a large file is read.
     if format not in (SWZ, *FORMATS):
         raise UserInputError(f"format '{format}' is none of {', '.join((SWZ, *FORMATS))}")
-    Target.of(size, quality, ratio, 0)  # what is wrong with it is told before a large file is read
+    Target.of(size, quality, ratio, 0)
     if gaussians is not None and gaussians < 1:
         raise UserInputError(f"{gaussians} Gaussians: at least 1 must stay")
+    if not 0 <= refine <= LONGEST:
+        raise UserInputError(f"refine {refine:g}: must be a number of seconds in 0 .. {LONGEST:,}")
+    if refine and format != SWZ:
+        raise UserInputError(f"only .swz files are refined, not .{format}: leave out one of the two")
+    if out is not None:
+        OUTPUT_FILE.check(os.fspath(out))
+    given = None if cameras is None else views_of_file(Path(cameras))
+    stages, plugins = Stages(), load_plugins() if plugins is None else plugins
     chosen = choose_device(device, plugins)
     with stages.timed("read"):
         source = open_source(scene, plugins, chosen)
@@ -97,12 +107,15 @@ def compress(
     model = source.model if sh_degree is None else with_degree(source.model, sh_degree)
     rasterizer = NegotiatedRasterizer(plugins, device=chosen, options=source.raster)
     with stages.timed("cameras"), torch.no_grad():
-        seen = views_of(source.model, rasterizer, None if cameras is None else Path(cameras), views)
+        seen = made_up_views(source.model, rasterizer, views) if given is None else given
         options = RasterOptions(alpha=True)
         judge = Pictures(source.model, seen.judge, rasterizer, options)
         held_out = Pictures(source.model, seen.held_out, rasterizer, options)
-    pruning = Pruning(model, seen.fit, rasterizer, keeps_unseen=not (drop_unseen or cameras))
-    work = _Work(source, model, judge, held_out, pruning, target, gaussians, stages, plugins, say)
+    keeps_unseen = not drop_unseen and given is None and gaussians is None
+    pruning = Pruning(model, seen.fit, rasterizer, keeps_unseen=keeps_unseen)
+    work = _Work(
+        source, model, judge, held_out, pruning, seen.fit, rasterizer, refine, target, gaussians, stages, plugins, say
+    )
     make = _make_swz if format == SWZ else _make_other(format)
     if out is not None:
         with replacing(out) as temporary:
@@ -150,6 +163,9 @@ class _Work:
     judge: Pictures
     held_out: Pictures
     pruning: Pruning
+    fit: list[Camera]
+    rasterizer: NegotiatedRasterizer
+    refine: float
     target: Target
     gaussians: int | None
     stages: Stages
@@ -162,57 +178,39 @@ def _make_swz(work: _Work, path: Path) -> tuple[GaussianModel, dict[str, Any]]:
     with work.stages.timed("sensitivities"):
         errors = Errors(coder, work.model, work.judge)
     search = Search(coder, work.model, work.pruning, work.judge, errors, work.gaussians)
-    with work.stages.timed("search"):
-        if work.target.size is not None:
-            choice = for_size(search, work.target.size)
-        else:
-            assert work.target.quality is not None  # one of the two is given
+    refined: Refined | None = None
+
+    def better(choice: Choice) -> Choice:
+        nonlocal refined
+        levels = choice.allocation.levels
+        with work.stages.timed("refine"):
+            refined = refine(choice.model, work.model, work.fit, work.rasterizer, coder, levels, seconds=work.refine)
+        return Choice(refined.model, errors.curves(coder, refined.model), choice.allocation)
+
+    if work.target.size is not None:
+        filled = fill(search, work.target.size, path, work.stages, work.say)
+        if work.refine:
+            filled = fill(search, work.target.size, path, work.stages, work.say, better(filled.choice))
+    else:
+        assert work.target.quality is not None  # one of the two is given
+        with work.stages.timed("search"):
             choice = for_quality(search, work.target.quality, work.held_out)
-    with work.stages.timed("encode"):
-        size, choice, encodes = _encoded(coder, choice, work.target.size, path, work.say)
+        if work.refine:
+            choice = measured_again(search, better(choice), work.target.quality, work.held_out)
+        with work.stages.timed("encode"):
+            filled = Filled(choice, coder.encode(choice.model, choice.allocation.levels, path), 1)
     with work.stages.timed("decode"):
         model, reader = open_model(path, work.plugins, work.model.device)
     assert isinstance(model, GaussianModel)  # of a method of explicit Gaussians
     facts = {
-        "bytes": size,
+        "bytes": filled.bytes,
         "sections": {"header": reader.header_bytes, **reader.sections},
-        "precision": coder.settings(choice.allocation.levels).model_dump(exclude={"positions", "entropy"}),
-        "encodes": encodes,
+        "precision": coder.settings(filled.choice.allocation.levels).model_dump(exclude={"positions", "entropy"}),
+        "encodes": filled.encodes,
+        "refined": None if refined is None else refined.as_dict(),
         "tried": [{"gaussians": n, "bytes": round(b), "psnr": round(q, 2)} for n, b, q in search.tried],
     }
     return model, facts
-
-
-def _encoded(
-    coder: Quantized, choice: Choice, size: int | None, path: Path, say: Callable[[str], None]
-) -> tuple[int, Choice, int]:
-    """Bytes of the file that was written, what it holds, and how often it was written."""
-    written = coder.encode(choice.model, choice.allocation.levels, path)
-    if size is None:
-        return written, choice, 1
-    encodes, best = 1, (written, choice) if written <= size else None
-    budget = choice.bytes
-    while encodes < MOST_ENCODES and not LEAST_SHARE * size < written <= size:
-        if written <= size and choice.is_finest:
-            say(f"the finest settings give {written:,} bytes, less than the target of {size:,}")
-            break
-        budget *= AIM * size / written
-        found = choice.resized(budget)
-        if found is None:
-            break
-        choice = found
-        written = coder.encode(choice.model, choice.allocation.levels, path)
-        encodes += 1
-        if written <= size and (best is None or written > best[0]):
-            best = written, choice
-    if best is None:
-        raise UserInputError(f"no file of {size:,} bytes was found: the smallest has {written:,} bytes")
-    if best[0] <= LEAST_SHARE * size and not best[1].is_finest:
-        say(f"{best[0]:,} bytes are the nearest to {size:,} that was found")
-    if best[0] != written:
-        written = coder.encode(best[1].model, best[1].allocation.levels, path)
-        encodes += 1
-    return written, best[1], encodes
 
 
 def _make_other(name: str) -> Callable[[_Work, Path], tuple[GaussianModel, dict[str, Any]]]:

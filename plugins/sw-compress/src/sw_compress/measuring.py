@@ -15,6 +15,10 @@ if TYPE_CHECKING:
 
 MEASURED = (0.0, 2.0)
 """Levels that are drawn; between and beyond them the error is a power of the step."""
+COARSER = (4.0, 6.0)
+"""Levels that are drawn besides where the error is too small to tell how it grows."""
+SMALL = 1e-6
+"""Mean squared error below which it is: 60 dB."""
 POWERS = (1.0, 2.6)
 """Of the step by which an error grows: 2 where renders are smooth in an attribute."""
 
@@ -28,24 +32,35 @@ class Errors:
     def __init__(self, coder: Quantized, model: GaussianModel, pictures: Pictures) -> None:
         names = coder.attributes(model)
         finest = coder.finest(model)
-        self._power: dict[str, tuple[float, float]] = {}
+        self._measured: dict[str, tuple[list[float], list[float]]] = {}
         with track("measure precision", total=1 + len(names) * len(MEASURED), unit="models") as bar:
             self.floor = pictures.error(coder.rounded(model, finest))
             bar.advance()
             for name in names:
-                found = []
-                for level in MEASURED:
+                levels, logs = list[float](), list[float]()
+                for level in (*MEASURED, *COARSER):
+                    if level > coder.levels(name)[-1] or (level not in MEASURED and 2.0 ** logs[-1] > SMALL):
+                        continue
                     error = pictures.error(coder.rounded(model, {**finest, name: level})) - self.floor
-                    found.append(max(error, 1e-14))
-                    bar.advance()
-                power = np.log2(found[1] / found[0]) / (MEASURED[1] - MEASURED[0])
-                self._power[name] = found[0], float(np.clip(power, *POWERS))
+                    levels, logs = [*levels, level], [*logs, float(np.log2(max(error, 1e-14)))]
+                    bar.advance(level in MEASURED)
+                self._measured[name] = levels, logs
 
     def at(self, name: str, levels: np.ndarray) -> np.ndarray:
         """Mean squared error [L]."""
-        error, power = self._power[name]
-        found: np.ndarray = error * 2.0 ** (power * levels)
-        return found
+        known, logs = self._measured[name]
+        low, high = (
+            float(np.clip((logs[j] - logs[i]) / (known[j] - known[i]), *POWERS)) for i, j in ((0, 1), (-2, -1))
+        )
+        if len(known) > len(MEASURED):  # the least are noise: the error grows as it does where it can be seen
+            below = logs[-1] + high * (levels - known[-1])
+        else:
+            below = logs[0] + low * (levels - known[0])
+        between = np.interp(levels, known, logs)
+        found = np.where(levels > known[-1], logs[-1] + high * (levels - known[-1]), between)
+        found = np.where(levels < known[0], below, found)
+        result: np.ndarray = 2.0**found
+        return result
 
     def curves(self, coder: Quantized, model: GaussianModel) -> list[Curve]:
         """Bytes and errors of all attributes of a model, which may be a part of the one that was measured."""

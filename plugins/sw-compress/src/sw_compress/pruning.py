@@ -34,7 +34,8 @@ class Pruning:
     """Removals in order, made as far as they are asked for: what `rows` returns for fewer is a part of that for more.
 
     cameras         that judge
-    keeps_unseen    whether Gaussians that none of them shows stay: cameras that were made up prove nothing
+    keeps_unseen    whether Gaussians that none of them shows stay: cameras that were made up prove nothing; else they
+                    go first
     """
 
     def __init__(
@@ -64,8 +65,12 @@ class Pruning:
         self._age += 1
         allowed = min(wanted, max(1, int(ROUND_SHARE * len(self._left))))
         order = torch.sort(self._costs, stable=True).indices
-        order = order[self._among_neighbours(order) < AT_ONCE]
-        order = order[self._costs[order].isfinite()][:allowed]
+        unseen = int((self._costs < 0).sum())
+        if unseen:  # they change nothing, however many go
+            order = order[: min(wanted, unseen)]
+        else:
+            order = order[self._among_neighbours(order) < AT_ONCE]
+            order = order[self._costs[order].isfinite()][:allowed]
         if not len(order):
             return False
         self._gone.append(self._left[order])
@@ -75,7 +80,7 @@ class Pruning:
         return True
 
     def _score(self) -> None:
-        """Judge what is left; infinite for what may not go."""
+        """Judge what is left: infinite for what may not go, below zero for what is not seen and may."""
         part = select(self._model, self._left)
         with track(f"judge {len(self._left):,} Gaussians", total=len(self._cameras), unit="views") as bar:
             costs = removal_costs(
@@ -85,7 +90,7 @@ class Pruning:
         unseen = costs.scores["blend_max"] < SEEN
         if not self._gone:
             self.unseen = int(unseen.sum())
-        self._costs = torch.where(unseen & self._keeps_unseen, torch.inf, costs.change)
+        self._costs = torch.where(unseen, torch.inf if self._keeps_unseen else -1.0, costs.change)
         self._age = 0
 
     def _among_neighbours(self, order: Tensor) -> Tensor:

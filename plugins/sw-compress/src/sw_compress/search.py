@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import torch
 
 from splatwizard_core.api import GaussianModel, UserInputError
-from sw_compress.allocation import Allocation, Curve, at_price, within
+from sw_compress.allocation import Allocation, Curve, at_price, of_error, within
 from sw_compress.coders import FIXED_BYTES, POSITIONS, Quantized
 from sw_compress.measuring import Errors
 from sw_compress.quality import Pictures, decibels
@@ -24,9 +23,10 @@ SHARES = (1.0, 0.8, 0.64, 0.5, 0.4, 0.3, 0.2, 0.14, 0.1, 0.05, 0.02)
 """Shares of the Gaussians that are tried, until it gets worse."""
 PATIENCE = 2
 """Shares that may be worse than the best before the rest is left out."""
-SPARE = 1.03
-"""Head-room of an estimate that is told as a size."""
-QUALITY_TRIES = 10
+QUALITY_TRIES = 16
+KEPT = 100_000
+"""Gaussians up to which all parts that were looked at are kept."""
+COARSEST_PRICE = 1e300
 
 
 @dataclass
@@ -36,6 +36,7 @@ class Search:
     pictures    of the source at cameras to choose with
     count       how many Gaussians stay; None: what is best
     tried       (gaussians, bytes estimated, dB against the source) of each that was drawn
+    coarsest    the smallest by the estimate of all that was looked at
     """
 
     coder: Quantized
@@ -45,6 +46,8 @@ class Search:
     errors: Errors
     count: int | None = None
     tried: list[tuple[int, float, float]] = field(default_factory=list)
+    coarsest: Choice | None = None
+    _known: dict[int, tuple[GaussianModel, list[Curve]]] = field(default_factory=dict)
 
     def parts(self) -> list[int]:
         """Numbers of Gaussians to try, falling."""
@@ -53,9 +56,21 @@ class Search:
             return [min(self.count, whole)]
         return sorted({max(1, round(share * whole)) for share in SHARES}, reverse=True)
 
-    def part(self, count: int) -> GaussianModel:
-        """The model with as many Gaussians as `count`, or as few as may stay."""
-        return self.model if count == self.model.num_rows else select(self.model, self.pruning.rows(count))
+    def part(self, count: int) -> tuple[GaussianModel, list[Curve]]:
+        """The model with as many Gaussians as `count`, or as few as may stay, and its curves."""
+        if count not in self._known:
+            part = self.model if count == self.model.num_rows else select(self.model, self.pruning.rows(count))
+            found = part, self.errors.curves(self.coder, part)
+            if self.model.num_rows > KEPT:
+                return found
+            self._known[count] = found
+        return self._known[count]
+
+    def note_coarsest(self, part: GaussianModel, curves: list[Curve]) -> None:
+        """Remember a part at its coarsest, if nothing smaller is known."""
+        choice = Choice(part, curves, at_price(curves, COARSEST_PRICE))
+        if self.coarsest is None or choice.bytes < self.coarsest.bytes:
+            self.coarsest = choice
 
 
 @dataclass(frozen=True)
@@ -81,10 +96,17 @@ class Choice:
         """True where nothing can be more precise."""
         return all(self.allocation.levels[curve.name] == curve.levels[0] for curve in self.curves)
 
+    def coarsest(self) -> Choice:
+        """The same Gaussians as coarse as can be."""
+        return replace(self, allocation=at_price(self.curves, COARSEST_PRICE))
+
+    def placed(self) -> list[Curve]:
+        """The curves with places as precise as here."""
+        return [self._fixed(curve) if curve.name == POSITIONS else curve for curve in self.curves]
+
     def resized(self, budget: float) -> Choice | None:
         """The same Gaussians, places as precise as here, in a file of `budget` bytes by the estimate."""
-        fixed = [self._fixed(curve) if curve.name == POSITIONS else curve for curve in self.curves]
-        found = within(fixed, budget - FIXED_BYTES)
+        found = within(self.placed(), budget - FIXED_BYTES)
         return None if found is None else replace(self, allocation=found)
 
     def _fixed(self, curve: Curve) -> Curve:
@@ -93,47 +115,35 @@ class Choice:
         return Curve(curve.name, curve.levels[part], curve.bytes[part], curve.error[part], True)
 
 
-def for_size(search: Search, size: int) -> Choice:
-    """The best picture in an estimated `size`. Raises UserInputError where nothing is so small."""
+def for_size(search: Search, budget: float) -> Choice | None:
+    """The best picture in a file of an estimated `budget` bytes; None where nothing is so small."""
     best, best_error, worse = None, math.inf, 0
-    smallest = _coarsest(search)
-    if smallest > 2 * size:  # no part that is worth more has half the bytes of one that is evenly taken
-        raise _too_small(size, smallest)
     for count in search.parts():
-        part = search.part(count)
-        curves = search.errors.curves(search.coder, part)
-        found = within(curves, size - FIXED_BYTES)
-        if found is None:
-            smallest = FIXED_BYTES + sum(float(curve.bytes[-1]) for curve in curves)
-            if part.num_rows > 1.02 * count:  # the rest may not go
-                break
-            continue
-        error = search.pictures.error(search.coder.rounded(part, found.levels))
-        choice = Choice(part, curves, found)
-        search.tried.append((part.num_rows, choice.bytes, decibels(error)))
-        if error < best_error:
-            best, best_error, worse = choice, error, 0
-        else:
-            worse += 1
-        if worse == PATIENCE or part.num_rows > 1.02 * count:
+        part, curves = search.part(count)
+        search.note_coarsest(part, curves)
+        found = within(curves, budget - FIXED_BYTES)
+        last = part.num_rows > 1.02 * count  # the rest may not go
+        if found is not None:
+            choice = Choice(part, curves, found)
+            error = search.pictures.error(search.coder.rounded(part, found.levels))
+            search.tried.append((part.num_rows, choice.bytes, decibels(error)))
+            if error < best_error:
+                best, best_error, worse = choice, error, 0
+            else:
+                worse += 1
+        if worse == PATIENCE or last:
             break
-    if best is None:
-        raise _too_small(size, smallest)
     return best
 
 
-def _coarsest(search: Search) -> float:
-    """Bytes of the fewest Gaussians as coarse as can be, evenly taken instead of the best."""
+def least_bytes(search: Search) -> float:
+    """Bytes by the estimate of the fewest Gaussians as coarse as can be, evenly taken instead of the best.
+
+    No part that is worth more has half of them.
+    """
     few = torch.arange(0, search.model.num_rows, max(1, search.model.num_rows // search.parts()[-1]))
     part = select(search.model, few.to(search.model.device)[: search.parts()[-1]])
     return FIXED_BYTES + sum(float(size[-1]) for size in search.coder.sizes(part).values())
-
-
-def _too_small(size: int, smallest: float) -> UserInputError:
-    return UserInputError(
-        f"no file of {size:,} bytes holds this scene: the smallest that is possible has about "
-        f"{math.ceil(SPARE * smallest):,} bytes"
-    )
 
 
 def for_quality(search: Search, quality: float, held_out: Pictures) -> Choice:
@@ -144,12 +154,11 @@ def for_quality(search: Search, quality: float, held_out: Pictures) -> Choice:
     wanted = 10 ** (-quality / 10)
     found: list[Choice] = []
     for count in search.parts():
-        part = search.part(count)
-        curves = search.errors.curves(search.coder, part)
+        part, curves = search.part(count)
         lost = search.pictures.error(search.coder.rounded(part, search.coder.finest(part)))
         if lost >= wanted and found:
             break
-        allocation = _of_error(curves, max(wanted - lost, 0.02 * wanted))
+        allocation = of_error(curves, max(wanted - lost, 0.02 * wanted))
         found.append(Choice(part, curves, allocation))
         search.tried.append((part.num_rows, found[-1].bytes, decibels(lost + allocation.error)))
         best = min(range(len(found)), key=lambda i: found[i].bytes)
@@ -166,18 +175,9 @@ def for_quality(search: Search, quality: float, held_out: Pictures) -> Choice:
     )
 
 
-def _of_error(curves: Sequence[Curve], error: float) -> Allocation:
-    """The cheapest levels whose error by the tables is at most `error`, or the finest."""
-    low, high = -60.0, 20.0
-    best = at_price(curves, math.exp(low))
-    for _ in range(60):
-        middle = (low + high) / 2
-        found = at_price(curves, math.exp(middle))
-        if found.error > error:
-            high = middle
-        else:
-            low, best = middle, found
-    return best
+def measured_again(search: Search, choice: Choice, quality: float, held_out: Pictures) -> Choice:
+    """The choice as coarse as the quality allows, or as it is."""
+    return _measured(search, choice, quality, held_out)[1] or choice
 
 
 def _measured(search: Search, choice: Choice, quality: float, held_out: Pictures) -> tuple[float, Choice | None]:
@@ -185,26 +185,27 @@ def _measured(search: Search, choice: Choice, quality: float, held_out: Pictures
 
     None where its finest settings are not that good.
     """
-    wanted = choice.allocation.error
-    good: tuple[float, Choice] | None = None
-    bad: float | None = None
-    haste = 1.0
-    reached = -math.inf
+    good: tuple[float, float, Choice] | None = None  # error by the tables, dB reached
+    bad: tuple[float, float] | None = None
+    wanted, haste, reached, curves = choice.allocation.error, 1.0, -math.inf, choice.curves
     for _ in range(QUALITY_TRIES):
-        found = Choice(choice.model, choice.curves, _of_error(choice.curves, wanted))
+        found = Choice(choice.model, choice.curves, of_error(curves, wanted))
         reached = held_out.quality(search.coder.rounded(found.model, found.allocation.levels)).psnr
         if reached >= quality:
-            if good is None or found.bytes < good[1].bytes:
-                good = wanted, found
+            if good is None or found.bytes < good[2].bytes:
+                good = wanted, reached, found
             if reached <= quality + QUALITY_MARGIN:
                 break
         else:
-            bad = wanted
+            bad = wanted, reached
             if found.is_finest:
                 break
+        if good is not None and curves is choice.curves:  # a bit of the positions is a jump: the rest goes on from it
+            curves, bad = good[2].placed(), None
         if good is not None and bad is not None:
-            wanted = math.sqrt(good[0] * bad)
+            share = (quality + QUALITY_MARGIN / 2 - bad[1]) / max(good[1] - bad[1], 1e-6)
+            wanted = bad[0] * (good[0] / bad[0]) ** min(max(share, 0.1), 0.9)
         else:  # part of the error may be of what was pruned, which no precision mends
             wanted *= 10 ** (haste * (reached - quality - QUALITY_MARGIN / 2) / 10)
-            haste *= 2
-    return reached, None if good is None else good[1]
+            haste = min(2 * haste, 4.0)
+    return reached, None if good is None else good[2]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
@@ -77,9 +76,3 @@ def _source(name: str, model: GaussianModel, file_bytes: int | None) -> Source:
     if not bool(drawn.any()):
         raise SceneError(f"{name}: holds no Gaussian that could be seen")
     return Source(name, model if bool(drawn.all()) else select(model, drawn), model.num_rows, file_bytes)
-
-
-def default_output(path: Path, suffix: str) -> Path:
-    """Path beside the source with the suffix of the format."""
-    found = path.with_suffix(suffix)
-    return found if found != path else path.with_name(f"{path.stem}-small{suffix}")

@@ -6,12 +6,10 @@ import math
 import re
 from dataclasses import dataclass
 
+from sw_gaussians.byte_sizes import parse_size
+
 from splatwizard_core.api import UserInputError
 
-UNITS = {
-    "": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 1 << 10, "mib": 1 << 20, "gib": 1 << 30,
-}  # fmt: skip
-LARGEST = 1 << 50
 LEAST_SHARE = 0.99
 """Share of the target that a file fills at least, where the source can."""
 QUALITY_MARGIN = 0.2
@@ -53,17 +51,6 @@ class Target:
 
     def __str__(self) -> str:
         return f"{self.size:,} bytes" if self.size is not None else f"{self.quality:g} dB"
-
-
-def parse_size(text: str | int) -> int:
-    """Return bytes of `8MB` (10^6), `8MiB` (2^20), `800kB` or a number of bytes. Raises UserInputError."""
-    match = re.fullmatch(r"\s*([0-9]+(?:\.[0-9]*)?|\.[0-9]+)\s*([a-zA-Z]*)\s*", str(text))
-    if match is None or match[2].lower() not in UNITS:
-        raise UserInputError(f"size '{text}' is none: give bytes, or a number with kB, MB, GB, KiB, MiB or GiB: 8MB")
-    found = float(match[1]) * UNITS[match[2].lower()]
-    if not 1 <= found <= LARGEST:
-        raise UserInputError(f"size '{text}' must be 1 byte to {LARGEST >> 40:,} TiB")
-    return int(found)
 
 
 def parse_quality(text: str | float) -> float:

@@ -12,7 +12,7 @@ from sw_gaussians.made_up_cameras import plausible_cameras
 from splatwizard_core.api import Camera, GaussianModel, UserInputError
 
 if TYPE_CHECKING:
-    from splatwizard_core.api import Rasterizer
+    from splatwizard_core.api import Rasterizer, Scene
 
 LEAST, MOST = {"cpu": 18, "cuda": 48}, {"cpu": 60, "cuda": 120}
 """Cameras in all that are made up, by kind of device: the fewer, the more Gaussians there are."""
@@ -47,20 +47,35 @@ class Views:
         }  # fmt: skip
 
 
-def views_of(model: GaussianModel, rasterizer: Rasterizer, cameras: Path | None, count: int | None) -> Views:
-    """Cameras of a file, or made up, `count` in all; None: by the number of Gaussians."""
-    if cameras is not None:
-        found = read_cameras(cameras).cameras
-        if len(found) < 3:
-            raise UserInputError(f"{cameras}: {len(found)} cameras; at least 3 are needed, of which 2 are set aside")
-        aside = max(1, round(len(found) * HELD_OUT))
-        places = set(_even(len(found), 2 * aside))
-        chosen = [camera for i, camera in enumerate(found) if i in places]
-        rest = [camera for i, camera in enumerate(found) if i not in places]
-        return Views(cameras.name, "given", rest, chosen[::2], chosen[1::2])
+def views_of_file(path: Path) -> Views:
+    """Cameras of a file, at least 3. Raises SceneError, UserInputError."""
+    found = read_cameras(path).cameras
+    if len(found) < 3:
+        raise UserInputError(f"{path}: {len(found)} cameras; at least 3 are needed, of which 2 are set aside")
+    aside = max(1, round(len(found) * HELD_OUT))
+    places = set(_even(len(found), 2 * aside))
+    chosen = [camera for i, camera in enumerate(found) if i in places]
+    rest = [camera for i, camera in enumerate(found) if i not in places]
+    return Views(path.name, "given", rest, chosen[::2], chosen[1::2])
+
+
+def training_views(model: GaussianModel, scene: Scene) -> Views:
+    """Some training cameras of a scene, evenly spread: as many as would be made up."""
+    cameras = [view.camera for view in scene.train]
+    found = [cameras[i] for i in _even(len(cameras), min(_usual(model), len(cameras)))]
+    judge = set(_even(len(found), max(1, round(len(found) * JUDGED))))
+    fit = [camera for i, camera in enumerate(found) if i not in judge]
+    return Views(scene.name, "training", fit or found, [found[i] for i in sorted(judge)], [])
+
+
+def _usual(model: GaussianModel) -> int:
     device = model.device.type
-    if count is None:
-        count = min(max(int(DRAWN[device] / model.num_rows), LEAST[device]), MOST[device])
+    return min(max(int(DRAWN[device] / model.num_rows), LEAST[device]), MOST[device])
+
+
+def made_up_views(model: GaussianModel, rasterizer: Rasterizer, count: int | None) -> Views:
+    """Cameras from the scene alone, `count` in all; None: by the number of Gaussians."""
+    device, count = model.device.type, _usual(model) if count is None else count
     held_out, judge = max(1, round(count * HELD_OUT)), max(1, round(count * JUDGED))
     made = plausible_cameras(
         model, rasterizer, fit=count - judge - held_out, held_out=judge + held_out, widest=WIDEST[device]

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from splatwizard_core.api import GaussianModel, Method, PluginError, SceneError
 from sw_gaussians.choices import CodecChoice
+from sw_gaussians.sized import Filling
 from sw_gaussians.start import gaussians_from_points, start_points
 from sw_gaussians.surfels import SurfelModel, state_surface, stated_surface
 
@@ -64,9 +65,13 @@ class GaussianMethod(Method):
         """
         if not isinstance(model, GaussianModel):
             raise TypeError(f"{self.name} encodes a GaussianModel, not a {type(model).__name__}")
-        writer.static[HEADER_KEY] = self.config.codec.name
+        codec: CodecChoice = self.config.codec
+        filling = codec.provider(self.plugins, "codec.name")(self.plugins, **codec.settings)
+        if isinstance(filling, Filling):
+            model, codec = filling.chosen(model, self.name, writer.raster, self.scene)
+        writer.static[HEADER_KEY] = codec.name
         state_surface(model, writer)
-        self.config.codec.load(self.plugins).encode(model, writer)
+        codec.load(self.plugins).encode(model, writer)
 
     def decode(self, reader: ContainerReader) -> SplatModel:
         """Decode the model with the codec that the header names. Raises BitstreamError."""

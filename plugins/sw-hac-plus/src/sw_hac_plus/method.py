@@ -67,7 +67,11 @@ class HACPlus(Method):
         )  # fmt: skip
 
     def stages(self) -> Sequence[Stage]:
-        return [HACPlusStage(self.config, pictures=self.config.pictures.load(self.plugins))]
+        stage = HACPlusStage(self.config, pictures=self.config.pictures.load(self.plugins))
+        if self.config.size:
+            lead, first = self.plugins.tasks.load("lead-to-size"), stage.at(self.config.phases.entropy)
+            stage.leading = lead(self.config.size, self.name, first, stage.iterations)
+        return [stage]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         if not isinstance(model, HACPlusAnchors):

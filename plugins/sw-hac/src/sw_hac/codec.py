@@ -105,6 +105,8 @@ def settled_copy(model: Model, weights: WeightType) -> Model:
         )
     model = copy.deepcopy(model).to("cpu").eval()
     model.fold_units()
+    base, factors = model.base_steps, model.led.get("steps", (1, 1, 1))
+    model.base_steps = base[0] * factors[0], base[1] * factors[1], base[2] * factors[2]
     round_networks(model.networks(), weights)
     return model
 
@@ -157,10 +159,7 @@ def read_grid(reader: ContainerReader, features: int, plugins: PluginManager) ->
 
 
 def walk(
-    attributes: AttributeCoder,
-    predictor: Predictor,
-    geometry: AnchorGeometry,
-    sections: Mapping[str, str] = SECTIONS,
+    attributes: AttributeCoder, predictor: Predictor, geometry: AnchorGeometry, sections: Mapping[str, str] = SECTIONS
 ) -> None:
     """Code all groups of each block of anchors: encoder and decoder go over them in this order.
 

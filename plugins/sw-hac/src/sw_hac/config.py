@@ -111,6 +111,7 @@ class HACParams(CodedAnchorParams):
     phases: Phases = Field(Phases(), description="when training turns to noise, and to a rate")
     rate_term: RateTerm = Field(RateTerm(), description="rate term of the loss")
     steps: Steps = Field(Steps(), description="quantiser steps before they are predicted")
+    size: str = Field("", description="bytes of the file at most: 5MB; lambda is led to it; empty: as lambda has it")
 
     @property
     def margin(self) -> Margin:

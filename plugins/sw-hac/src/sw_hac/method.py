@@ -37,7 +37,11 @@ class HAC(Method):
         return HACAnchors.of_scene(scene, self.config, generator)
 
     def stages(self) -> Sequence[Stage]:
-        return [HACStage(self.config, pictures=self.config.pictures.load(self.plugins))]
+        stage = HACStage(self.config, pictures=self.config.pictures.load(self.plugins))
+        if self.config.size:
+            lead, first = self.plugins.tasks.load("lead-to-size"), stage.at(self.config.phases.entropy)
+            stage.leading = lead(self.config.size, self.name, first, stage.iterations)
+        return [stage]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         if not isinstance(model, HACAnchors):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from sw_anchors.coded_anchors import ENTROPY, QUANTIZED
 from sw_anchors.phase_switch import PhaseSwitch
@@ -26,6 +26,7 @@ class HACStage(CodedAnchorStage):
 
     name = "hac"
     opt: HACParams
+    leading: Any = None  # task of a training to a size, with its `steps`
 
     def learning_rates(self, step: int) -> Mapping[str, float]:
         lr = self.opt.lr
@@ -43,6 +44,8 @@ class HACStage(CodedAnchorStage):
         PhaseSwitch(self.at(phases.entropy), ENTROPY).register(scheduler)
         if self.opt.rate_term.start == "statistics":
             scheduler.register_task(self.at(phases.entropy), self.start_from_statistics)
+        if self.leading is not None:
+            scheduler.register_task(self.leading.steps, self.leading, name="lead lambda to the size")
 
     def start_from_statistics(self, model: HACAnchors) -> None:
         """Start the network behind the grid at mean and deviation of the values, see the model's method."""
@@ -61,9 +64,10 @@ class HACStage(CodedAnchorStage):
         if rate is None:
             return {}
         assert rate.own_bits is not None
-        weights = self.opt.rate_term
+        factor: float = model.led.get("factor", 1.0)
+        weight, masks = factor * self.opt.rate_term.weight, factor * self.opt.rate_term.masks
         terms = {
-            "rate": (weights.weight, rate.bits),
-            "grid": (weights.weight / max(model.num_rows * sum(model.shape.widths), 1), rate.own_bits),
+            "rate": (weight, rate.bits),
+            "grid": (weight / max(model.num_rows * sum(model.shape.widths), 1), rate.own_bits),
         }
-        return {**terms, "masks": (weights.masks, model.soft_masks().mean())} if weights.masks else terms
+        return {**terms, "masks": (masks, model.soft_masks().mean())} if masks else terms

@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 from sw_gaussians.choices import Choosing, CodecChoice, Moved, PrunerChoice
 from sw_gaussians.finetune.fine_tuning import FineTuningRates
 from sw_gaussians.finetune.pruning import CountRule
+from sw_gaussians.sized import Sized
 
 
 class Prune(PrunerChoice):
@@ -44,7 +45,7 @@ class Rates(FineTuningRates):
     decay: float = Field(0.95, gt=0, le=1, description="factor on all rates but that of the means, again and again")
 
 
-class Pup3DGSConfig(Choosing):
+class Pup3DGSConfig(Sized, Choosing):
     """Everything that can be set for PUP 3D-GS."""
 
     FULL_ITERATIONS: ClassVar[int] = 10_000

@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 from pydantic import Field
 from sw_gaussians.choices import Choosing, CodecChoice, Moved, PrunerChoice
 from sw_gaussians.older_keys import within
+from sw_gaussians.sized import Sized
 
 
 class Prune(PrunerChoice):
@@ -19,7 +20,7 @@ class Prune(PrunerChoice):
     interval: int = Field(3_000, ge=1, description="steps between removals")
 
 
-class SpeedySplatConfig(Choosing):
+class SpeedySplatConfig(Sized, Choosing):
     """Everything that can be set for Speedy-Splat."""
 
     OLDER: ClassVar[Mapping[str, Moved]] = {

@@ -8,6 +8,7 @@ from typing import ClassVar, Literal
 from pydantic import Field, model_validator
 from sw_gaussians.choices import Choosing, CodecChoice, Moved, PrunerChoice
 from sw_gaussians.finetune.fine_tuning import FineTuningRates
+from sw_gaussians.sized import Sized
 
 
 class Prune(PrunerChoice):
@@ -43,7 +44,7 @@ class Prune(PrunerChoice):
         return self
 
 
-class TrimmingTheFatConfig(Choosing):
+class TrimmingTheFatConfig(Sized, Choosing):
     """Everything that can be set for Trimming the Fat."""
 
     FULL_ITERATIONS: ClassVar[int] = 15_000

@@ -73,16 +73,9 @@ def encode(source: Path, out: Path | None, no_psnr: bool, as_json: bool, chosen:
 )  # fmt: skip
 @takes_choices
 def decode(
-    file: Path,
-    out: Path | None,
-    repeats: int,
-    hash_only: bool,
-    packets: int | None,
-    size: int | None,
-    partial: bool,
-    as_json: bool,
-    chosen: Choices,
-) -> None:
+    file: Path, out: Path | None, repeats: int, hash_only: bool, packets: int | None, size: int | None, partial: bool,
+    as_json: bool, chosen: Choices,
+) -> None:  # fmt: skip
     """Decode FILE.swz from nothing but itself; report time, counts and the digest of the model."""
     from splatwizard_core.coding.container import ContainerReader
     from splatwizard_core.coding.cuts import Prefix

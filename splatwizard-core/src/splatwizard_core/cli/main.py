@@ -144,7 +144,8 @@ def _report(error: BaseException, arguments: Sequence[str], *, debug: bool) -> i
     if debug and not isinstance(error, (click.ClickException, click.Abort)):
         traceback.print_exception(error)
     if isinstance(error, (KeyboardInterrupt, click.Abort)):
-        _say(f"interrupted (the same command{' without --fresh' if '--fresh' in arguments else ''} resumes a run)")
+        how = f" (the same command{' without --fresh' if '--fresh' in arguments else ''} resumes a run)"
+        _say("interrupted" + how * bool({"run", "train"} & {*arguments[:2]}))
         return 130
     if isinstance(error, click.exceptions.NoArgsIsHelpError):
         _say(error.format_message())

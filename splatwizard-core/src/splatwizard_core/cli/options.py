@@ -30,6 +30,12 @@ def _not_empty(_context: click.Context, parameter: click.Parameter, value: str |
     return value
 
 
+def _key(context: click.Context, parameter: click.Parameter, value: str | None) -> None:
+    """Hand an option that stands for a key of its name to --set."""
+    if value is not None:
+        context.params["sets"] += (f"{parameter.name}={value}",)
+
+
 def _seeds(text: str) -> int | tuple[int, ...]:
     first, *more = (click.IntRange(min=0).convert(each, None, None) for each in text.split(","))  # type: ignore[arg-type]
     return (first, *more) if more else first
@@ -70,7 +76,7 @@ config_option = click.option(
     help="TOML file of values; config.toml of a run directory repeats that run.  [default: none]",
 )  # fmt: skip
 set_option = click.option(
-    "--set", "sets", multiple=True, metavar="KEY=VALUE", type=KEY,
+    "--set", "sets", multiple=True, metavar="KEY=VALUE", type=KEY, is_eager=True,  # before those that stand for a key
     help="One value, such as iterations=7000 (steps) or resolution=4; repeatable, wins over everything else.",
 )  # fmt: skip
 init_option = click.option(
@@ -131,6 +137,14 @@ def options(*decorators: Callable[[F], F]) -> Callable[[F], F]:
         return function
 
     return apply
+
+
+size_options = options(  # of a training; a method takes those that are keys of its config
+    click.option("--size", metavar="SIZE", expose_value=False, callback=_key,
+                 help="Bytes of the file, never more: 5MB.  [default: as --rate says]"),
+    click.option("--gaussians", metavar="N", expose_value=False, callback=_key,
+                 help="Gaussians that the training makes at most.  [default: as the method's plan says]"),
+)  # fmt: skip
 
 
 def say(message: str) -> None:

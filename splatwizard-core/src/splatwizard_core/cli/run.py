@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 @click.command(short_help="train, encode, decode, evaluate, report: one scene")
 @shared.options(
     shared.methods_option, shared.scene_option, shared.images_option, shared.rates_option, shared.preset_option,
-    shared.init_option, shared.config_option, shared.set_option, shared.out_option, shared.device_option,
-    shared.seeds_option, shared.repeats_option, shared.geometry_option, shared.resume_option,
+    shared.size_options, shared.init_option, shared.config_option, shared.set_option, shared.out_option,
+    shared.device_option, shared.seeds_option, shared.repeats_option, shared.geometry_option, shared.resume_option,
     shared.changed_plan_option, shared.json_option, shared.debug_option,
 )  # fmt: skip
 @takes_choices

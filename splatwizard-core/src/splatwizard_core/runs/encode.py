@@ -40,14 +40,9 @@ NEEDED_KINDS = ("method", "quantizer", "entropy model", "context model", "coder"
 
 
 def encode(
-    method: Method,
-    model: SplatModel,
-    raster: dict[str, Any],
-    path: Path,
-    origin: Origin = NOWHERE,
-    *,
+    method: Method, model: SplatModel, raster: dict[str, Any], path: Path, origin: Origin = NOWHERE, *,
     deterministic: bool = False,
-) -> EncodingFacts:
+) -> EncodingFacts:  # fmt: skip
     """Write one file; returns the facts of the encoding, for the record and for what is done again later.
 
     raster          what the header asks of a rasterizer
@@ -115,9 +110,14 @@ def finished_training(session: Session, resolved: ResolvedConfig, directory: Pat
 def encode_directory(session: Session, resolved: ResolvedConfig, directory: Path, target: Path) -> EncodingFacts:
     """Encode the finished training of a run directory. Raises UserInputError if it is not finished."""
     with finished_training(session, resolved, directory) as trained:
-        method, raster = make_method(session.plugins, resolved), trained.facts.raster
-        origin = session.scene(resolved).origin
-        return encode(method, trained.model, raster, target, origin, deterministic=resolved.ppl.deterministic)
+        return encode_trained(session, resolved, trained, target)
+
+
+def encode_trained(session: Session, resolved: ResolvedConfig, trained: TrainedModel, target: Path) -> EncodingFacts:
+    """Encode a model that was trained on the scene of a configuration."""
+    method, scene = make_method(session.plugins, resolved), session.scene(resolved)
+    method.scene, raster = scene, trained.facts.raster
+    return encode(method, trained.model, raster, target, scene.origin, deterministic=resolved.ppl.deterministic)
 
 
 def encode_ply(session: Session, resolved: ResolvedConfig, path: Path, target: Path) -> EncodingFacts:

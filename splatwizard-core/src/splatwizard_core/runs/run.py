@@ -19,7 +19,7 @@ from splatwizard_core.runs import record as schema
 from splatwizard_core.runs.config import ResolvedConfig, content_hash
 from splatwizard_core.runs.decode import REPEATS
 from splatwizard_core.runs.directory import CONFIG, ENCODED, RENDERS, RunRequest, StepLog, held_directory, write_config
-from splatwizard_core.runs.encode import encode
+from splatwizard_core.runs.encode import encode_trained
 from splatwizard_core.runs.facts import (
     CONTENDED,
     DecodingFacts,
@@ -32,7 +32,6 @@ from splatwizard_core.runs.facts import (
 from splatwizard_core.runs.fresh import decode_fresh, run_fresh
 from splatwizard_core.runs.identity import training_key
 from splatwizard_core.runs.phases import phases_of_run
-from splatwizard_core.runs.pretrained import make_method
 from splatwizard_core.runs.session import Session, TrainedModel
 from splatwizard_core.runs.training import train
 
@@ -51,9 +50,7 @@ def run(session: Session, request: RunRequest) -> tuple[schema.Record, Path]:
 
         def encode_it() -> EncodingFacts:
             trained = train_in(session, request, directory)
-            method = make_method(session.plugins, resolved)
-            raster, origin = trained.facts.raster, session.scene(resolved).origin
-            facts = encode(method, trained.model, raster, encoded, origin, deterministic=resolved.ppl.deterministic)
+            facts = encode_trained(session, resolved, trained, encoded)
             session.say(f"encoded {facts.bytes:,} bytes in {facts.encode_s:.2f} s")
             return facts
 

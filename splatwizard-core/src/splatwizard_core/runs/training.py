@@ -182,14 +182,9 @@ def _folders(parent: Path) -> list[Path]:
 
 
 def _train_stages(
-    session: Session,
-    request: RunRequest,
-    directory: Path,
-    loaded: list[Entry],
-    stop_after: int | None,
-    *,
+    session: Session, request: RunRequest, directory: Path, loaded: list[Entry], stop_after: int | None, *,
     watched: bool,
-) -> tuple[SplatModel, TrainingFacts]:
+) -> tuple[SplatModel, TrainingFacts]:  # fmt: skip
     """Train the stages of a method in a directory, or load what its checkpoints say is finished.
 
     loaded      entries that the registries are asked for meanwhile, as it grows
