@@ -15,7 +15,7 @@ from splatwizard_core.runs.decode import decode_model
 GOLDEN = Path(__file__).parent / "golden"
 ROOT = Path(__file__).parents[1]
 FACTS = json.loads((GOLDEN / "golden.json").read_text())
-FOREIGN = {"spz", "sog", "splat", "compressed-ply", "gsc-quant"}
+FOREIGN = {"spz", "sog", "splat", "compressed-ply"}
 """Methods whose file is a format of others: bytes from their descriptions are in the tests of sw-interchange."""
 
 
