@@ -51,6 +51,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from sw_bench.gsc import TITLE
+from sw_bench.gsc.protocol import not_available
 from sw_bench.gsc.tables import BD_COLUMNS, COLUMNS, QUALITIES, bd_rows, csv_text
 from sw_report.distance import spearman
 from sw_report.equal_psnr import CurvePoint, at_equal
@@ -543,7 +544,8 @@ def main() -> None:
         plugins = load_plugins()
         views = {scene: views_of(args.data, scene, plugins) for scene in models}
         if "gsc" in parts:
-            free = [entry.name for entry in plugins.methods if entry.declared.get("training_free")]
+            absent = not_available(plugins)
+            free = [e.name for e in plugins.methods if e.declared.get("training_free") and e.name not in absent]
             run_gsc(models, args.codecs.split(",") if args.codecs else free, views, args)
         if "scores" in parts:
             run_scores(models, views, args)

@@ -8,6 +8,8 @@ import io
 import json
 import os
 import re
+import sys
+import types
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +24,7 @@ from sw_bench.gsc.views import Asked, camera_hash, size_of, views_of
 from sw_gaussians.ply import export_ply
 from sw_interchange.ply_cameras import PlyCamera, ply_camera_comments
 
-from splatwizard_core.api import Camera, GaussianModel, UserInputError
+from splatwizard_core.api import Camera, CapabilityError, GaussianModel, UserInputError
 from splatwizard_core.cli.main import main
 from splatwizard_core.plugins import load_plugins
 
@@ -209,6 +211,19 @@ def test_a_codec_that_fails_has_a_row_without_values(tmp_path: Path, capsys, fil
     assert (rows["splat"]["bytes"], rows["splat"]["flags"]) == (None, "failed")
     assert rows["splat"]["reason"] == "sw encode: out of luck"
     assert rows["compressed-ply"]["bytes"] > 0
+
+
+def test_a_codec_whose_program_is_not_here_is_left_out_and_named(monkeypatch, capsys):
+    monkeypatch.delenv("SPLATWIZARD_TMC3", raising=False)
+    session = types.SimpleNamespace(plugins=load_plugins())
+    found = {entry.name for entry in protocol.codecs_of(protocol.Plan([], Path()), session)}
+    assert {"gsc-quant", "3dgs", "spz"} <= found
+    assert "tmc13" not in found
+    assert "tmc13 is left out: not available: tmc13 needs MPEG's program tmc3" in capsys.readouterr().err
+    with pytest.raises(CapabilityError, match="SPLATWIZARD_TMC3"):
+        protocol.codecs_of(protocol.Plan([], Path(), codecs=["tmc13"]), session)
+    monkeypatch.setenv("SPLATWIZARD_TMC3", sys.executable)  # any program
+    assert "tmc13" in {entry.name for entry in protocol.codecs_of(protocol.Plan([], Path()), session)}
 
 
 def test_a_process_that_fails_tells_its_last_line(tmp_path: Path):
