@@ -43,6 +43,11 @@ MADE_UP = 12
         "--path", "is_path", is_flag=True,
         help="The cameras of --cameras are the frames of a path with a fixed step: tell of flicker and popping too.",
     ),
+    click.option(
+        "--path-metrics", metavar="NAME[,NAME]",
+        help="Models of vision of the path as a video, slow: cvvdp (sw-metrics[cvvdp]), vmaf (an ffmpeg with "
+        "libvmaf).  [default: none]",
+    ),
     click.option("--published", is_flag=True, help="Compare runs with published figures of their data set and scene."),
     click.option("--own", is_flag=True, help="Published figures of the measured methods alone."),
     device_option, json_option, debug_option,
@@ -52,6 +57,7 @@ def compare(
     paths: tuple[Path, ...],
     cameras: Path | None,
     is_path: bool,
+    path_metrics: str | None,
     published: bool,
     own: bool,
     as_json: bool,
@@ -77,7 +83,8 @@ def compare(
         raise click.UsageError("--own is for --published")
     if is_path and cameras is None:
         raise click.UsageError("--path is for --cameras FILE")
-    print_facts(_compared(paths[0], paths[1], cameras, chosen, is_path=is_path), as_json, _tell)
+    names = _video_metrics(path_metrics, is_path)
+    print_facts(_compared(paths[0], paths[1], cameras, chosen, is_path=is_path, video=names), as_json, _tell)
 
 
 def _beside_published(folders: tuple[Path, ...], own: bool, as_json: bool) -> None:
@@ -94,7 +101,21 @@ def _beside_published(folders: tuple[Path, ...], own: bool, as_json: bool) -> No
     print_facts({"tables": [to_dict(table) for table in tables], "notes": collection.notes}, as_json, told)
 
 
-def _compared(a: Path, b: Path, camera_file: Path | None, chosen: Choices, *, is_path: bool) -> dict[str, Any]:
+def _video_metrics(text: str | None, is_path: bool) -> tuple[str, ...]:
+    """Names of --path-metrics. Raises click.UsageError for others, and without --path."""
+    from sw_report.path_video import METRICS
+
+    names = tuple(dict.fromkeys(name.strip() for name in (text or "").split(",") if name.strip()))
+    if unknown := [name for name in names if name not in METRICS]:
+        raise click.UsageError(f"--path-metrics {unknown[0]}: give some of {', '.join(METRICS)}")
+    if text is not None and not (is_path and names):
+        raise click.UsageError(f"--path-metrics is for --path, with some of {', '.join(METRICS)}")
+    return names
+
+
+def _compared(
+    a: Path, b: Path, camera_file: Path | None, chosen: Choices, *, is_path: bool, video: tuple[str, ...]
+) -> dict[str, Any]:
     from splatwizard_core.api import GaussianModel, UserInputError
     from splatwizard_core.tooling import load_plugins, open_session
     from sw_report.attribute_errors import attribute_errors
@@ -127,7 +148,7 @@ def _compared(a: Path, b: Path, camera_file: Path | None, chosen: Choices, *, is
         "attributes": errors and errors.as_dict(),
         "no_attributes": reason,
         "cameras": seen_from,
-        "psnr": compare_pictures(left, right, places, _with_pictures(test), is_path=is_path),
+        "psnr": compare_pictures(left, right, places, _with_pictures(test), is_path=is_path, video=video),
     }
 
 
@@ -151,6 +172,11 @@ def _with_pictures(views: list[View]) -> list[View] | None:
     return views if views and all(view.load is not None for view in views) else None
 
 
+def _told_of_video(found: dict[str, Any]) -> list[str]:
+    lines = [f"{name} of the video: {found[name]:.2f} ({made})" for name, made in found.get("made_with", {}).items()]
+    return lines + [f"{name} is not available: {why}" for name, why in found.get("not_available", {}).items()]
+
+
 def _tell(facts: dict[str, Any]) -> None:
     from splatwizard_core.tooling import print_table
 
@@ -166,11 +192,13 @@ def _tell(facts: dict[str, Any]) -> None:
     click.echo(f"B against A: {psnr['mean']:.2f} dB, at least {psnr['least']:.2f} dB, from {seen}")
     if "path" in psnr:
         path = psnr["path"]
-        told = {name: "-" if path[name] is None else f"{path[name]:.3g}" for name in path}
+        told = {name: "-" if value is None else f"{value:.3g}" for name, value in path.items() if name != "video"}
         click.echo(
             f"along the path, {told['frames']} frames: flicker {told['flicker']} levels (of first differences "
             f"{told['flicker1']}), PSNR {told['psnr']} dB, popping {told['popping_a']} of A, {told['popping_b']} of B"
         )
+        for line in _told_of_video(path.get("video", {})):
+            click.echo(line)
     if attributes is None:
         click.echo(f"no errors of attributes: {facts['no_attributes']}")
         return
