@@ -8,6 +8,7 @@ import io
 import json
 import os
 import re
+import subprocess
 import sys
 import types
 from pathlib import Path
@@ -229,6 +230,18 @@ def test_a_codec_whose_program_is_not_here_is_left_out_and_named(monkeypatch, ca
 def test_a_process_that_fails_tells_its_last_line(tmp_path: Path):
     with pytest.raises(CodecFailedError, match=r"sw info: .*nothing\.swz: there is no such file"):
         coding.run(["info", "nothing.swz"], tmp_path)
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="the system does not tell a process's size")
+def test_a_process_is_not_charged_with_the_size_of_its_parent():
+    ballast = bytearray(200_000_000)
+    process = subprocess.Popen(
+        [sys.executable, "-S", "-c", "held = bytearray(40_000_000); import time; time.sleep(0.2)"]
+    )
+    peak = coding._peak_of(process)
+    assert process.returncode == 0
+    assert peak is not None
+    assert 40 < peak < 100 < len(ballast) / 1e6
 
 
 @pytest.mark.parametrize(("words", "told"), [
