@@ -191,6 +191,17 @@ def test_two_files_without_a_scene_are_seen_by_cameras_that_are_made_up(capsys, 
     assert f"{facts['psnr']['mean']:.2f} dB" in told
 
 
+def test_metrics_that_are_named_are_of_b_against_a(capsys, folder: Path):
+    words = (folder / "a.ply", folder / "b.ply", "--metrics", "ssim,l1")
+    found = run(capsys, *words)["metrics"]
+    assert found["ssim"]["direction"] == "higher"
+    assert 0 < found["ssim"]["mean"] < 1
+    assert len(found["l1"]["per_view"]) == 12
+    same = run(capsys, words[0], words[0], *words[2:])["metrics"]
+    assert same["ssim"]["mean"] == pytest.approx(1, abs=1e-6)  # sums of float32
+    assert same["l1"]["mean"] == 0
+
+
 def test_on_a_scene_both_stand_beside_the_pictures(capsys, folder: Path):
     facts = run(capsys, folder / "a.ply", folder / "b.ply", "--scene", "demo:tiny")
     assert facts["psnr"]["views"] == 2
@@ -295,6 +306,8 @@ def test_pictures_that_are_no_numbers_have_no_psnr():
     (["{}/a.ply", "{}/none.ply"], "there is no such file"), (["{}/a.ply", "{}/b.ply", "--own"], "--own is for"),
     (["{}/a.ply", "{}/b.ply", "--path-metrics", "vmaf"], "--path-metrics is for --path"),
     (["{}/a.ply", "{}/b.ply", "--path-metrics", "vmaff"], "give some of cvvdp, vmaf"),
+    (["{}/a.ply", "{}/b.ply", "--metrics", "ssimm"], "did you mean 'ssim'"),
+    (["{}/a.ply", "{}/b.ply", "--metrics", "path_angle"], "it is not of pictures"),
     (["{}/a.ply", "{}"], "has no scene.swz"), (["{}/a.ply", "{}/b.ply", "--cameras", "{}/a.ply"], "not a JSON file"),
 ])  # fmt: skip
 def test_wrong_input_is_told_in_a_line(capsys, folder: Path, arguments: list[str], told: str):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +15,7 @@ from splatwizard_core.tooling import (
     device_option,
     images_option,
     json_option,
+    name_of,
     options,
     print_facts,
     scene_option,
@@ -40,6 +41,10 @@ MADE_UP = 12
         "scene 12 that are made up]",
     ),
     click.option(
+        "--metrics", metavar="NAME[,NAME]", type=name_of("metric"),
+        help="Metrics of pictures that B's are measured by against A's, such as ssim,flip.  [default: PSNR alone]",
+    ),
+    click.option(
         "--path", "is_path", is_flag=True,
         help="The cameras of --cameras are the frames of a path with a fixed step: tell of flicker and popping too.",
     ),
@@ -56,6 +61,7 @@ MADE_UP = 12
 def compare(
     paths: tuple[Path, ...],
     cameras: Path | None,
+    metrics: str | None,
     is_path: bool,
     path_metrics: str | None,
     published: bool,
@@ -83,8 +89,8 @@ def compare(
         raise click.UsageError("--own is for --published")
     if is_path and cameras is None:
         raise click.UsageError("--path is for --cameras FILE")
-    names = _video_metrics(path_metrics, is_path)
-    print_facts(_compared(paths[0], paths[1], cameras, chosen, is_path=is_path, video=names), as_json, _tell)
+    asked = _Asked(_names(metrics), is_path, _video_metrics(path_metrics, is_path))
+    print_facts(_compared(paths[0], paths[1], cameras, chosen, asked), as_json, _tell)
 
 
 def _beside_published(folders: tuple[Path, ...], own: bool, as_json: bool) -> None:
@@ -101,11 +107,24 @@ def _beside_published(folders: tuple[Path, ...], own: bool, as_json: bool) -> No
     print_facts({"tables": [to_dict(table) for table in tables], "notes": collection.notes}, as_json, told)
 
 
+@dataclass(frozen=True)
+class _Asked:
+    """What to tell of the pictures besides PSNR: metrics by name, whether they are a path, and metrics of its video."""
+
+    metrics: tuple[str, ...]
+    is_path: bool
+    video: tuple[str, ...]
+
+
+def _names(text: str | None) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(name.strip() for name in (text or "").split(",") if name.strip()))
+
+
 def _video_metrics(text: str | None, is_path: bool) -> tuple[str, ...]:
     """Names of --path-metrics. Raises click.UsageError for others, and without --path."""
     from sw_report.path_video import METRICS
 
-    names = tuple(dict.fromkeys(name.strip() for name in (text or "").split(",") if name.strip()))
+    names = _names(text)
     if unknown := [name for name in names if name not in METRICS]:
         raise click.UsageError(f"--path-metrics {unknown[0]}: give some of {', '.join(METRICS)}")
     if text is not None and not (is_path and names):
@@ -113,12 +132,11 @@ def _video_metrics(text: str | None, is_path: bool) -> tuple[str, ...]:
     return names
 
 
-def _compared(
-    a: Path, b: Path, camera_file: Path | None, chosen: Choices, *, is_path: bool, video: tuple[str, ...]
-) -> dict[str, Any]:
+def _compared(a: Path, b: Path, camera_file: Path | None, chosen: Choices, asked: _Asked) -> dict[str, Any]:
     from splatwizard_core.api import GaussianModel, UserInputError
     from splatwizard_core.tooling import load_plugins, open_session
     from sw_report.attribute_errors import attribute_errors
+    from sw_report.compared_metrics import PictureMetrics
     from sw_report.compared_models import compare_pictures, open_file
 
     configs = [path / "config.toml" for path in (a, b) if (path / "config.toml").is_file()]
@@ -132,6 +150,7 @@ def _compared(
     resolved = of_runs[0] if of_runs else chosen.resolve_without_method()
     session = open_session(resolved, load_plugins())
     scene = session.scene(resolved) if chosen.scene is not None or configs else None
+    metrics = PictureMetrics(asked.metrics, session.plugins, session.device, resolved.metrics)
     left, right = (open_file(path, session, resolved, scene) for path in (a, b))
     test = [] if scene is None or camera_file is not None else scene.test
     places, seen_from = [view.camera for view in test], f"test views of {scene.name}" if scene is not None else ""
@@ -142,13 +161,17 @@ def _compared(
     if isinstance(left.model, GaussianModel) and isinstance(right.model, GaussianModel):
         errors = attribute_errors(left.model, right.model)
     reason = None if errors else "no finite Gaussians" if explicit else "the Gaussians depend on the camera"
+    pictures = compare_pictures(
+        left, right, places, _with_pictures(test), is_path=asked.is_path, video=asked.video, metrics=metrics
+    )
     return {
         "a": left.facts(),
         "b": right.facts(),
         "attributes": errors and errors.as_dict(),
         "no_attributes": reason,
         "cameras": seen_from,
-        "psnr": compare_pictures(left, right, places, _with_pictures(test), is_path=is_path, video=video),
+        "psnr": pictures,
+        "metrics": metrics.result(),
     }
 
 
@@ -190,6 +213,9 @@ def _tell(facts: dict[str, Any]) -> None:
     print_table(["", "A", "B"], rows)
     seen = f"{psnr['views']} cameras ({facts['cameras']})"
     click.echo(f"B against A: {psnr['mean']:.2f} dB, at least {psnr['least']:.2f} dB, from {seen}")
+    for name, found in facts["metrics"].items():
+        value = "not available: " + found.get("reason", "") if found["mean"] is None else f"{found['mean']:.4f}"
+        click.echo(f"{name} of B against A: {value}")
     if "path" in psnr:
         path = psnr["path"]
         told = {name: "-" if value is None else f"{value:.3g}" for name, value in path.items() if name != "video"}

@@ -23,6 +23,7 @@ from splatwizard_core.tooling import (
     render_view,
     suggested_rasterizers,
 )
+from sw_report.compared_metrics import PictureMetrics
 from sw_report.path_flicker import PathFlicker
 from sw_report.path_video import PathVideo
 
@@ -91,12 +92,14 @@ def compare_pictures(
     *,
     is_path: bool = False,
     video: tuple[str, ...] = (),
+    metrics: PictureMetrics | None = None,
 ) -> dict[str, Any]:
     """PSNR of B against A, mean and least over the cameras, dB; with `views` also of each against its pictures.
 
     views   whose cameras they are, with pictures, or None
     is_path the cameras are frames of a path with a fixed step: `path` tells of flicker and popping
     video   metrics of the path as a video (`sw_report.path_video`)
+    metrics takes every pair of pictures besides
     """
     path = PathFlicker()
     between, to_truth = [], ([], [])  # type: tuple[list[float], tuple[list[float], list[float]]]
@@ -106,6 +109,8 @@ def compare_pictures(
         for i, camera in enumerate(cameras):
             pictures = a.picture(camera), b.picture(camera)
             between.append(capped_psnr(*pictures))
+            if metrics is not None:
+                metrics.add(*pictures)
             if is_path:
                 path.add(*pictures)
             if frames is not None:
