@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from sw_report import path_video
+from sw_report.compare import VIDEO_METRICS
 from sw_report.path_video import PathVideo
 
 from splatwizard_core.api import CapabilityError
@@ -71,6 +72,10 @@ def test_what_is_missing_is_told_with_what_to_install(monkeypatch: pytest.Monkey
     assert (found["cvvdp"], found["vmaf"]) == (None, None)
     assert found["not_available"]["cvvdp"] == "package-missing: pip install 'sw-metrics[cvvdp]'"
     assert "ffmpeg with libvmaf" in found["not_available"]["vmaf"]
+
+
+def test_the_command_offers_the_metrics_that_there_are():
+    assert set(VIDEO_METRICS) == set(path_video.METRICS)
 
 
 def test_frames_are_of_one_size():

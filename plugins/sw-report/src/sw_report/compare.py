@@ -29,6 +29,12 @@ if TYPE_CHECKING:
 
 MADE_UP = 12
 """Pictures where neither a scene nor cameras are given."""
+VIDEO_METRICS = ("cvvdp", "vmaf")
+"""Names of `sw_report.path_video`, which completion does not import: it would load torch."""
+
+
+def _video_words(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[str]:
+    return [name for name in VIDEO_METRICS if name.startswith(incomplete)]
 
 
 @click.command(short_help="two files; a run beside published figures")
@@ -49,7 +55,7 @@ MADE_UP = 12
         help="The cameras of --cameras are the frames of a path with a fixed step: tell of flicker and popping too.",
     ),
     click.option(
-        "--path-metrics", metavar="NAME[,NAME]",
+        "--path-metrics", metavar="NAME[,NAME]", shell_complete=_video_words,
         help="Models of vision of the path as a video, slow: cvvdp (sw-metrics[cvvdp]), vmaf (an ffmpeg with "
         "libvmaf).  [default: none]",
     ),
@@ -109,7 +115,7 @@ def _beside_published(folders: tuple[Path, ...], own: bool, as_json: bool) -> No
 
 @dataclass(frozen=True)
 class _Asked:
-    """What to tell of the pictures besides PSNR: metrics by name, whether they are a path, and metrics of its video."""
+    """Wishes about the pictures besides PSNR: metrics by name, whether they are a path, and metrics of its video."""
 
     metrics: tuple[str, ...]
     is_path: bool
@@ -122,13 +128,11 @@ def _names(text: str | None) -> tuple[str, ...]:
 
 def _video_metrics(text: str | None, is_path: bool) -> tuple[str, ...]:
     """Names of --path-metrics. Raises click.UsageError for others, and without --path."""
-    from sw_report.path_video import METRICS
-
     names = _names(text)
-    if unknown := [name for name in names if name not in METRICS]:
-        raise click.UsageError(f"--path-metrics {unknown[0]}: give some of {', '.join(METRICS)}")
+    if unknown := [name for name in names if name not in VIDEO_METRICS]:
+        raise click.UsageError(f"--path-metrics {unknown[0]}: give some of {', '.join(VIDEO_METRICS)}")
     if text is not None and not (is_path and names):
-        raise click.UsageError(f"--path-metrics is for --path, with some of {', '.join(METRICS)}")
+        raise click.UsageError(f"--path-metrics is for --path, with some of {', '.join(VIDEO_METRICS)}")
     return names
 
 
