@@ -15,6 +15,7 @@ from sw_report.compare import VIDEO_METRICS
 from sw_report.path_video import PathVideo
 
 from splatwizard_core.api import CapabilityError
+from splatwizard_core.plugins import load_plugins
 
 FAKE = """#!{python}
 import json, pathlib, sys
@@ -44,7 +45,7 @@ def ffmpeg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def measured(names: tuple[str, ...], a: float, b: float, frames: int = 2) -> dict:
-    with PathVideo(names) as video:
+    with PathVideo(names, load_plugins()) as video:
         for _ in range(frames):
             video.add(torch.full((3, 4, 5), a / 255), torch.full((3, 4, 5), b / 255))
         return video.result()
@@ -64,10 +65,7 @@ def test_what_ffmpeg_says_is_told(ffmpeg: Path):
 def test_what_is_missing_is_told_with_what_to_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     monkeypatch.setenv("PATH", str(tmp_path))
 
-    def absent(name: str) -> str:
-        raise path_video.importlib.metadata.PackageNotFoundError(name)
-
-    monkeypatch.setattr(path_video.importlib.metadata, "version", absent)
+    monkeypatch.setattr(type(load_plugins().metrics.load("cvvdp")), "version", lambda self: None)
     found = measured(("cvvdp", "vmaf"), 1, 2)
     assert (found["cvvdp"], found["vmaf"]) == (None, None)
     assert found["not_available"]["cvvdp"] == "package-missing: pip install 'sw-metrics[cvvdp]'"
@@ -79,7 +77,7 @@ def test_the_command_offers_the_metrics_that_there_are():
 
 
 def test_frames_are_of_one_size():
-    with PathVideo(("vmaf",)) as video:
+    with PathVideo(("vmaf",), load_plugins()) as video:
         video.add(torch.zeros(3, 4, 5), torch.zeros(3, 4, 5))
         with pytest.raises(CapabilityError, match="one size"):
             video.add(torch.zeros(3, 4, 6), torch.zeros(3, 4, 6))
@@ -95,7 +93,7 @@ def moving(noise: float) -> dict:
     g = torch.Generator().manual_seed(0)
     coarse = torch.rand(1, 3, 8, 8, generator=g)
     base = torch.nn.functional.interpolate(coarse, size=(96, 130), mode="bicubic")[0].clamp(0, 1)
-    with PathVideo(("cvvdp", "vmaf")) as video:
+    with PathVideo(("cvvdp", "vmaf"), load_plugins()) as video:
         for t in range(4):
             frame = torch.roll(base, t, 2)
             video.add(frame, frame + noise * torch.randn(frame.shape, generator=g))

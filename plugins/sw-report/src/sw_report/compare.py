@@ -142,6 +142,7 @@ def _compared(a: Path, b: Path, camera_file: Path | None, chosen: Choices, asked
     from sw_report.attribute_errors import attribute_errors
     from sw_report.compared_metrics import PictureMetrics
     from sw_report.compared_models import compare_pictures, open_file
+    from sw_report.path_video import PathVideo
 
     configs = [path / "config.toml" for path in (a, b) if (path / "config.toml").is_file()]
     of_runs = [replace(chosen, config_file=str(config)).resolve_without_method() for config in configs]
@@ -165,8 +166,9 @@ def _compared(a: Path, b: Path, camera_file: Path | None, chosen: Choices, asked
     if isinstance(left.model, GaussianModel) and isinstance(right.model, GaussianModel):
         errors = attribute_errors(left.model, right.model)
     reason = None if errors else "no finite Gaussians" if explicit else "the Gaussians depend on the camera"
+    video = PathVideo(asked.video, session.plugins, resolved.metrics) if asked.video else None
     pictures = compare_pictures(
-        left, right, places, _with_pictures(test), is_path=asked.is_path, video=asked.video, metrics=metrics
+        left, right, places, _with_pictures(test), is_path=asked.is_path, video=video, metrics=metrics
     )
     return {
         "a": left.facts(),

@@ -91,21 +91,21 @@ def compare_pictures(
     views: list[View] | None,
     *,
     is_path: bool = False,
-    video: tuple[str, ...] = (),
+    video: PathVideo | None = None,
     metrics: PictureMetrics | None = None,
 ) -> dict[str, Any]:
     """PSNR of B against A, mean and least over the cameras, dB; with `views` also of each against its pictures.
 
     views   whose cameras they are, with pictures, or None
     is_path the cameras are frames of a path with a fixed step: `path` tells of flicker and popping
-    video   metrics of the path as a video (`sw_report.path_video`)
+    video   measures the path as a video
     metrics takes every pair of pictures besides
     """
     path = PathFlicker()
     between, to_truth = [], ([], [])  # type: tuple[list[float], tuple[list[float], list[float]]]
     with contextlib.ExitStack() as stack:
         bar = stack.enter_context(track("compare", total=len(cameras), unit="views"))
-        frames = stack.enter_context(PathVideo(video)) if video else None
+        frames = stack.enter_context(video) if video is not None else None
         for i, camera in enumerate(cameras):
             pictures = a.picture(camera), b.picture(camera)
             between.append(capped_psnr(*pictures))

@@ -6,13 +6,12 @@ splats disagree about which measures go with opinions. Source: specification of 
 
 from __future__ import annotations
 
-import contextlib
-import importlib.metadata
 import json
 import math
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
@@ -20,10 +19,10 @@ from typing import IO, Any
 import torch
 from torch import Tensor
 
-from splatwizard_core.api import CapabilityError
+from splatwizard_core.api import CapabilityError, MetricSetup
+from splatwizard_core.tooling import PluginManager
 
 FPS = 30
-DISPLAY = "standard_fhd"  # 24 inches from 0.6 m
 LIMITED = "scale=out_color_matrix=bt709:out_range=limited,format=yuv420p"
 NO_CVVDP = "package-missing: pip install 'sw-metrics[cvvdp]'"
 NO_VMAF = "program-missing: put an ffmpeg with libvmaf on the PATH (`ffmpeg -filters` lists it)"
@@ -33,16 +32,20 @@ NO_VMAF = "program-missing: put an ffmpeg with libvmaf on the PATH (`ffmpeg -fil
 class PathVideo:
     """Takes the frames of A and B while they come, into files of a temporary folder; then measures both videos.
 
-    names   of the metrics that are asked for, out of METRICS
+    names       of the metrics that are asked for, out of METRICS
+    settings    of metrics, by group: `metrics.cvvdp.display`
+    size        width and height of the frames
     """
 
     names: tuple[str, ...]
+    plugins: PluginManager
+    settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    size: tuple[int, int] = (0, 0)
+    frames: int = 0
     _folder: tempfile.TemporaryDirectory[str] = field(
         default_factory=lambda: tempfile.TemporaryDirectory(prefix="sw-path-")
     )
     _files: list[IO[bytes]] = field(default_factory=list)
-    _size: tuple[int, int] | None = None
-    _frames: int = 0
 
     def __enter__(self) -> PathVideo:
         self._files = [path.open("wb") for path in self.videos]
@@ -61,9 +64,9 @@ class PathVideo:
     def add(self, reference: Tensor, render: Tensor) -> None:
         """Take the next frame of A and of B, [3,H,W] in 0..1. Raises CapabilityError for one of another size."""
         size = (int(reference.shape[2]), int(reference.shape[1]))
-        if self._size not in (None, size):
+        if self.frames and self.size != size:
             raise CapabilityError("a video has frames of one size: the cameras of --path differ in width or height")
-        self._size, self._frames = size, self._frames + 1
+        self.size, self.frames = size, self.frames + 1
         for file, frame in zip(self._files, (reference, render), strict=True):
             file.write(
                 torch.round(frame.clamp(0, 1) * 255).byte().permute(1, 2, 0).contiguous().cpu().numpy().tobytes()
@@ -76,40 +79,30 @@ class PathVideo:
         found: dict[str, Any] = {"made_with": {}, "not_available": {}}
         for name in self.names:
             try:
-                found[name], found["made_with"][name] = METRICS[name](self.videos, self._size or (0, 0), self._frames)
+                found[name], found["made_with"][name] = METRICS[name](self)
             except CapabilityError as error:
                 found[name] = None
                 found["not_available"][name] = str(error)
         return found
 
 
-def cvvdp(videos: list[Path], size: tuple[int, int], frames: int) -> tuple[float, str]:
+def cvvdp(path: PathVideo) -> tuple[float, str]:
     """ColorVideoVDP in JOD, 10 where no difference is visible; and the version, display and rate.
 
     Raises CapabilityError without the package.
     """
-    try:
-        version = importlib.metadata.version("cvvdp")
-        with contextlib.suppress(ImportError):  # it lies with sw-metrics, and mends torchvision's import
-            from sw_metrics.torchvision_import import import_torchvision
-
-            import_torchvision()
-        import pycvvdp
-    except importlib.metadata.PackageNotFoundError:
-        raise CapabilityError(NO_CVVDP, missing=["cvvdp"]) from None
-    except ImportError as error:
-        raise CapabilityError(f"{NO_CVVDP} ({error})", missing=["cvvdp"]) from error
-    width, height = size
+    if "cvvdp" not in path.plugins.metrics:
+        raise CapabilityError(NO_CVVDP, missing=["cvvdp"])
+    target: Any = path.plugins.metrics.load("cvvdp")
     reference, test = (
-        torch.frombuffer(bytearray(path.read_bytes()), dtype=torch.uint8).view(frames, height, width, 3)
-        .permute(3, 0, 1, 2)[None].float() / 255 for path in videos
+        torch.frombuffer(bytearray(file.read_bytes()), dtype=torch.uint8)
+        .view(path.frames, path.size[1], path.size[0], 3).permute(3, 0, 1, 2).float() / 255 for file in path.videos
     )  # fmt: skip
-    metric = pycvvdp.cvvdp(display_name=DISPLAY, heatmap=None, temp_padding="replicate")
-    value, _ = metric.predict(test, reference, dim_order="BCFHW", frames_per_second=FPS)
-    return float(value), f"cvvdp {version}, {DISPLAY}, {FPS} frames a second"
+    value, made = target.of_video(MetricSetup(torch.device("cpu"), path.settings), test, reference, fps=FPS)
+    return value, ", ".join(f"{name} {each}" for name, each in made.items())
 
 
-def vmaf(videos: list[Path], size: tuple[int, int], frames: int) -> tuple[float, str]:
+def vmaf(path: PathVideo) -> tuple[float, str]:
     """VMAF of libvmaf's default model, the mean over frames in 0..100; and the version.
 
     Raises CapabilityError without an ffmpeg that has libvmaf, or where it fails.
@@ -117,10 +110,11 @@ def vmaf(videos: list[Path], size: tuple[int, int], frames: int) -> tuple[float,
     program = shutil.which("ffmpeg")
     if program is None or b" libvmaf " not in _said(program, "-hide_banner", "-filters"):
         raise CapabilityError(NO_VMAF, missing=["ffmpeg"])
-    log = videos[0].with_name("vmaf.json")
-    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", str(FPS)]
+    reference, test = path.videos
+    log = reference.with_name("vmaf.json")
+    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{path.size[0]}x{path.size[1]}", "-r", str(FPS)]
     graph = f"[0:v]{LIMITED}[test];[1:v]{LIMITED}[true];[test][true]libvmaf=log_fmt=json:log_path={log.name}"
-    words = [*raw, "-i", videos[1].name, *raw, "-i", videos[0].name, "-lavfi", graph, "-f", "null", "-"]
+    words = [*raw, "-i", test.name, *raw, "-i", reference.name, "-lavfi", graph, "-f", "null", "-"]
     told = _said(program, "-hide_banner", "-nostdin", "-loglevel", "error", *words, folder=log.parent)
     try:
         found = json.loads(log.read_bytes())
