@@ -14,8 +14,10 @@ gsc         `sw bench --protocol mpeg-gsc` of every scene's model (that of --mod
             else of `train`), one process a codec, seen from the scene's test views: every k-th where there are more
             than 32.
 scores      `sw eval` of every file of `gsc` on the same views, against the photographs, by all metrics; and of every
-            run under OUT/train and --runs DIR on its own test views.
-tables      OUT/tables.md, gsc.csv, gsc_bd.csv, correlations.csv, splits.csv, distance.html.
+            run under OUT/train and --runs DIR on its own test views. Records of earlier releases lack distances:
+            `path_distances.py` adds them.
+tables      OUT/tables.md, gsc.csv, gsc_bd.csv, correlations.csv, splits.csv, distances.csv, distance.html, and figures
+            of the distances where matplotlib is. `protocol_page.py OUT` puts them into docs/other_protocols.md.
 
 Metrics whose package or weights are not there are `not available`, and missing in the tables. --set
 metrics.lpips.weights=DIR says where LPIPS finds its weights. Processes run side by side, --gsc-jobs of gsc and scores
@@ -29,6 +31,7 @@ the files that show the view, where at least 8 do.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import csv
 import dataclasses
 import hashlib
@@ -51,12 +54,17 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from sw_bench.gsc import TITLE
+from sw_bench.gsc.protocol import not_available
 from sw_bench.gsc.tables import BD_COLUMNS, COLUMNS, QUALITIES, bd_rows, csv_text
-from sw_report.distance import spearman
+from sw_report.blocks import Table
+from sw_report.distance import EXPLAINED, HEADING, NEAR_TO_FAR, distance_table, reached, spearman, with_distances
 from sw_report.equal_psnr import CurvePoint, at_equal
+from sw_report.exports import to_markdown
+from sw_report.figures import write_figures
+from sw_report.runs import collect
 from sweep_cells import Cell, add_options, chosen, print_outcomes, run_cells
 
-from splatwizard_core.api import SceneOptions
+from splatwizard_core.api import SceneOptions, UserInputError
 from splatwizard_core.tooling import PluginManager, load_plugins, load_scene
 
 SW = [sys.executable, "-m", "splatwizard_core"]
@@ -344,13 +352,14 @@ def write_tables(scenes: Sequence[str], args: argparse.Namespace) -> None:
     bd = bd_rows(rows, ANCHOR) if rows else []
     (args.out / "gsc.csv").write_text(csv_text(COLUMNS, rows))
     (args.out / "gsc_bd.csv").write_text(csv_text(BD_COLUMNS, bd))
-    text = [*gsc_section(rows, bd), *correlation_section(rows, args), *split_section(args)]
-    (args.out / "tables.md").write_text("\n".join(text) + "\n")
     trained = [folder for folder in (args.out / "train", *args.runs) if any(folder.rglob("metrics.json"))]
+    text = [*gsc_section(rows, bd), *correlation_section(rows, args), *split_section(args)]
+    text += distance_section(trained, args.out)
+    (args.out / "tables.md").write_text("\n".join(text) + "\n")
     if trained:
         words = ["report", *map(str, trained), "--distance", str(args.out / "distance.html")]
         subprocess.run([*SW, *words], check=False, stdout=sys.stderr)
-    print(f"written: {args.out / 'tables.md'}, gsc.csv, gsc_bd.csv, correlations.csv, splits.csv, distance.html")
+    print(f"written: {args.out / 'tables.md'}, CSV files, distance.html")
 
 
 def gsc_section(rows: Sequence[dict[str, Any]], bd: Sequence[dict[str, Any]]) -> list[str]:
@@ -483,6 +492,31 @@ def split_section(args: argparse.Namespace) -> list[str]:
     return [*lines, ""]
 
 
+def distance_section(folders: Sequence[Path], out: Path) -> list[str]:
+    """Draw and list PSNR near to and far from the training views, of every run that tells both, scene by scene."""
+    runs = with_distances(collect(folders).runs) if folders else []
+    with (out / "distances.csv").open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["scene", "protocol", "run", "seeds", "group", "path_combined", "psnr"])
+        for run in runs:
+            for name, (distance, value) in zip(NEAR_TO_FAR, reached(run, "psnr").groups, strict=True):
+                writer.writerow([*run.place, run.label, len(run.seeds), name, distance, value])
+    if not runs:
+        return []
+    with contextlib.suppress(UserInputError):  # without matplotlib
+        write_figures(runs, out / "figures")
+    lines = [f"## {HEADING}", "", EXPLAINED, ""]
+    for place in dict.fromkeys(run.place for run in runs):
+        of_place = [run for run in runs if run.place == place]
+        lines += [f"### {place[0]}, `{place[1]}`", "", *table_lines(distance_table(of_place)), ""]
+    return lines
+
+
+def table_lines(table: Table) -> list[str]:
+    """A table of sw-report in Markdown, without its title."""
+    return to_markdown([("", table)], []).strip().removeprefix("****").strip().splitlines()
+
+
 def _mean_of(record: Mapping[str, Any], name: str, of: set[str] | None = None) -> float | None:
     """Mean of a metric over the views of a record, or over those of `of`."""
     found = record["metrics"].get(name)
@@ -543,7 +577,8 @@ def main() -> None:
         plugins = load_plugins()
         views = {scene: views_of(args.data, scene, plugins) for scene in models}
         if "gsc" in parts:
-            free = [entry.name for entry in plugins.methods if entry.declared.get("training_free")]
+            absent = not_available(plugins)
+            free = [e.name for e in plugins.methods if e.declared.get("training_free") and e.name not in absent]
             run_gsc(models, args.codecs.split(",") if args.codecs else free, views, args)
         if "scores" in parts:
             run_scores(models, views, args)

@@ -15,8 +15,8 @@ from splatwizard_core.runs.decode import decode_model
 GOLDEN = Path(__file__).parent / "golden"
 ROOT = Path(__file__).parents[1]
 FACTS = json.loads((GOLDEN / "golden.json").read_text())
-FOREIGN = {"spz", "sog", "splat", "compressed-ply", "gsc-quant"}
-"""Methods whose file is a format of others: bytes from their descriptions are in the tests of sw-interchange."""
+FOREIGN = {"spz", "sog", "splat", "compressed-ply", "tmc13"}
+"""Methods whose file is a format of others, or a program's: their bytes are in the tests of sw-interchange."""
 
 
 @pytest.fixture(scope="module")

@@ -7,10 +7,13 @@ import json
 import sys
 from argparse import Namespace
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
+import torch
+
+from splatwizard_core.api import UserInputError
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
@@ -18,7 +21,7 @@ BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 @pytest.fixture
 def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     monkeypatch.syspath_prepend(str(BENCHMARKS))
-    for each in ("sweep_cells", "protocol_tables"):
+    for each in ("sweep_cells", "protocol_tables", "protocol_page", "path_distances"):
         monkeypatch.delitem(sys.modules, each, raising=False)
     return importlib.import_module("protocol_tables")
 
@@ -82,3 +85,36 @@ def test_the_fall_is_from_every_eighth_view_to_the_sector(script, tmp_path):
     lines = script.split_section(Namespace(out=tmp_path, data=Path()))
     assert "| 3dgs | r6 | psnr | 25.00 | 20.00 | 20.00 | 5.00 |" in lines
     assert "3dgs,r6,psnr,25.0,20.0,20.0,5.0,2,2,room/3dgs,room/3dgs-sector" in (tmp_path / "splits.csv").read_text()
+
+
+def test_the_page_takes_the_sections_that_there_are_and_keeps_the_others(script):
+    page = importlib.import_module("protocol_page")
+    marks = "<!-- made by benchmarks/protocol_page.py -->"
+    text = f"# T\n\n{marks}\n\n## Metrics against metrics\n\nNot measured yet.\n\n"
+    text += "## Every 8th view against a sector\n\nold\n\n<!-- end -->\n\ntail\n"
+    made = page.filled(text, "## Every 8th view against `sector:60` on room\n\n| a |\n\n## How far\n\nnew\n")
+    assert "Not measured yet." in made
+    assert "| a |" in made
+    assert "old" not in made
+    assert made.endswith("new\n\n<!-- end -->\n\ntail\n")
+    assert page.filled(made, "") == made
+    assert page.MADE.search(page.PAGE.read_text()) is not None
+
+
+def test_distances_are_those_of_the_cameras(script):
+    distances = importlib.import_module("path_distances")
+
+    def view(name: str, x: float) -> SimpleNamespace:
+        camera = SimpleNamespace(R=torch.eye(3), tau=torch.tensor([-x, 0.0, 0.0]))
+        return SimpleNamespace(name=name, camera=camera)
+
+    scene = SimpleNamespace(
+        test=[view("b", 1), view("d", 5)], train=[view("a", 0), view("c", 2), view("e", 4)], path="s"
+    )
+    record = {"views": ["b", "d"], "metrics": {"psnr": {"per_view": [30.0, 20.0]}}}
+    found = distances.with_distances(record, scene)["metrics"]
+    assert found["path_distance"]["per_view"] == [0.5, 0.5]
+    assert found["path_angle"]["per_view"] == [0, 0]
+    assert found["path_combined"]["per_view"] == pytest.approx([1 / 2.2, 1 / 2.2])  # extent 1.1 x 2
+    with pytest.raises(UserInputError, match="test views are not"):
+        distances.with_distances({**record, "views": ["b"]}, scene)

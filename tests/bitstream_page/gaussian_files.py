@@ -284,6 +284,35 @@ def raht(static: dict[str, Any], sections: dict[str, bytes], unzstd: Callable[[b
     return {name: values.astype(np.float32) for name, values in found.items()}
 
 
+def gsc_quant(static: dict[str, Any], sections: dict[str, bytes]) -> dict[str, np.ndarray]:
+    n, degree, bits = static["num_gaussians"], static["sh_degree"], static["bits"]
+    points = octree(sections["position"]) if n else np.zeros((0, 3), np.int64)
+    rest = np.zeros((n, (degree + 1) ** 2 - 1, 3), np.float32)
+    check(len(points) == n, "number of points")
+
+    def values(section: str, attribute: str, width: int) -> np.ndarray:
+        codes = np.array(columns(sections[section], n, width) if n else [], np.float64).reshape(width, n).T
+        return under_range(codes, static["ranges"][attribute], bits)
+
+    for band in range(1, degree + 1):
+        found = values(f"sh{band}", "sh", 3 * (2 * band + 1))
+        rest[:, band**2 - 1 : (band + 1) ** 2 - 1] = found.reshape(n, 2 * band + 1, 3)
+    return {
+        "means": under_range(points, static["ranges"]["position"], static["position_bits"]),
+        "sh_dc": values("sh0", "sh", 3)[:, None],
+        "sh_rest": rest,
+        "opacity_logits": values("opacity", "opacity", 1)[:, 0],
+        "log_scales": values("scaling", "scale", 3),
+        "quats": values("rotation", "quaternion", 4),
+    }
+
+
+def under_range(codes: np.ndarray, ends: Any, bits: int) -> np.ndarray:
+    low, high = np.float64(ends[0]), np.float64(ends[1])
+    top = 2**bits - 1
+    return np.where(codes == top, high, low + codes * ((high - low) / top)).astype(np.float32)
+
+
 def morton_bits(point: list[int]) -> list[int]:
     """The bits of a Morton code that are set, as numbers."""
     return [1 << (3 * bit + axis) for axis in range(3) for bit in range(21) if point[axis] >> bit & 1]

@@ -10,7 +10,18 @@ from bitstream_page.anchor_files import cat, hac, hac_plus
 from bitstream_page.container import container
 from bitstream_page.entropy_models import ExactTables
 from bitstream_page.fields import check
-from bitstream_page.gaussian_files import chimera, compact, exact_mode, indexed, packed, ply, quantized, raht, vectree
+from bitstream_page.gaussian_files import (
+    chimera,
+    compact,
+    exact_mode,
+    gsc_quant,
+    indexed,
+    packed,
+    ply,
+    quantized,
+    raht,
+    vectree,
+)
 from bitstream_page.splat_files import wisp
 
 
@@ -36,13 +47,15 @@ def decode(data: bytes, unzstd: Callable[[bytes], bytes], tables: ExactTables) -
         return compact(static, sections, unzstd)
     known = (
         "pruned-3dgs", "trimming-the-fat", "pup-3dgs", "speedy-splat", "lightgaussian", "c3dgs", "mesongs",
-        "2dgs", "flat-3dgs", "trim-3dgs", "trim-2dgs", "trim-2dgs-scratch",
+        "2dgs", "flat-3dgs", "trim-3dgs", "trim-2dgs", "trim-2dgs-scratch", "gsc-quant",
     )  # fmt: skip
     check(header["method"] in known, "method")
     if static["codec"] == "gaussians-indexed":
         return indexed(static, sections, unzstd)
     if static["codec"] == "raht":
         return raht(static, sections, unzstd)
+    if static["codec"] == "gsc-quant":
+        return gsc_quant(static, sections)
     if static["codec"] == "vectree":
         return vectree(static, sections, unzstd)
     if static["codec"] == "gaussians-ply":

@@ -281,6 +281,16 @@ def splats(n: int, context: str, subsets: int = 1) -> SplatModel:
     return model
 
 
+def wide() -> GaussianModel:
+    """Gaussians whose positions and opacities the ranges of gsc-quant would clip, two of them at one place."""
+    model = procedural(9, 0)
+    with torch.no_grad():
+        model.means.mul_(64)
+        model.means[7] = model.means[2]
+        model.opacity_logits.mul_(8)
+    return model
+
+
 SMALL_VQ = {"vq.size": 4, "vq.iterations": 0}
 
 Case = tuple[str, str, dict[str, Any], Callable[[], SplatModel]]
@@ -347,6 +357,9 @@ CASES: dict[str, Case] = {
     "mesongs_corner_v1": ("mesongs", "r1", {}, lambda: settled(20, 0, "corner")),
     "mesongs_one_v1": ("mesongs", "r2", {}, lambda: settled(1, 1)),
     "mesongs_empty_v1": ("mesongs", "r3", {}, lambda: settled(0)),
+    "gsc_quant_v1": ("gsc-quant", "r5", {}, lambda: procedural(8, 2)),
+    "gsc_quant_auto_v1": ("gsc-quant", "r2", {}, wide),
+    "gsc_quant_empty_v1": ("gsc-quant", "r1", {}, lambda: procedural(0)),
     "wisp_v1": ("wisp", "r3", {}, lambda: splats(90, "pyramid")),
     "wisp_none_v1": ("wisp", "r5", {}, lambda: splats(90, "none")),
     "wisp_v2": ("wisp", "r3", {}, lambda: splats(90, "pyramid")),

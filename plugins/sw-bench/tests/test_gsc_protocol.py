@@ -8,6 +8,9 @@ import io
 import json
 import os
 import re
+import subprocess
+import sys
+import types
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +25,7 @@ from sw_bench.gsc.views import Asked, camera_hash, size_of, views_of
 from sw_gaussians.ply import export_ply
 from sw_interchange.ply_cameras import PlyCamera, ply_camera_comments
 
-from splatwizard_core.api import Camera, GaussianModel, UserInputError
+from splatwizard_core.api import Camera, CapabilityError, GaussianModel, UserInputError
 from splatwizard_core.cli.main import main
 from splatwizard_core.plugins import load_plugins
 
@@ -211,9 +214,34 @@ def test_a_codec_that_fails_has_a_row_without_values(tmp_path: Path, capsys, fil
     assert rows["compressed-ply"]["bytes"] > 0
 
 
+def test_a_codec_whose_program_is_not_here_is_left_out_and_named(monkeypatch, capsys):
+    monkeypatch.delenv("SPLATWIZARD_TMC3", raising=False)
+    session = types.SimpleNamespace(plugins=load_plugins())
+    found = {entry.name for entry in protocol.codecs_of(protocol.Plan([], Path()), session)}
+    assert {"gsc-quant", "3dgs", "spz"} <= found
+    assert "tmc13" not in found
+    assert "tmc13 is left out: not available: tmc13 needs MPEG's program tmc3" in capsys.readouterr().err
+    with pytest.raises(CapabilityError, match="SPLATWIZARD_TMC3"):
+        protocol.codecs_of(protocol.Plan([], Path(), codecs=["tmc13"]), session)
+    monkeypatch.setenv("SPLATWIZARD_TMC3", sys.executable)  # any program
+    assert "tmc13" in {entry.name for entry in protocol.codecs_of(protocol.Plan([], Path()), session)}
+
+
 def test_a_process_that_fails_tells_its_last_line(tmp_path: Path):
     with pytest.raises(CodecFailedError, match=r"sw info: .*nothing\.swz: there is no such file"):
         coding.run(["info", "nothing.swz"], tmp_path)
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="the system does not tell a process's size")
+def test_a_process_is_not_charged_with_the_size_of_its_parent():
+    ballast = bytearray(200_000_000)
+    process = subprocess.Popen(
+        [sys.executable, "-S", "-c", "held = bytearray(40_000_000); import time; time.sleep(0.2)"]
+    )
+    peak = coding._peak_of(process)
+    assert process.returncode == 0
+    assert peak is not None
+    assert 40 < peak < 100 < len(ballast) / 1e6
 
 
 @pytest.mark.parametrize(("words", "told"), [

@@ -191,6 +191,17 @@ def test_two_files_without_a_scene_are_seen_by_cameras_that_are_made_up(capsys, 
     assert f"{facts['psnr']['mean']:.2f} dB" in told
 
 
+def test_metrics_that_are_named_are_of_b_against_a(capsys, folder: Path):
+    words = (folder / "a.ply", folder / "b.ply", "--metrics", "ssim,l1")
+    found = run(capsys, *words)["metrics"]
+    assert found["ssim"]["direction"] == "higher"
+    assert 0 < found["ssim"]["mean"] < 1
+    assert len(found["l1"]["per_view"]) == 12
+    same = run(capsys, words[0], words[0], *words[2:])["metrics"]
+    assert same["ssim"]["mean"] == pytest.approx(1, abs=1e-6)  # sums of float32
+    assert same["l1"]["mean"] == 0
+
+
 def test_on_a_scene_both_stand_beside_the_pictures(capsys, folder: Path):
     facts = run(capsys, folder / "a.ply", folder / "b.ply", "--scene", "demo:tiny")
     assert facts["psnr"]["views"] == 2
@@ -222,7 +233,7 @@ def test_models_without_attributes_are_seen_by_given_cameras(tmp_path: Path, cap
     assert facts["psnr"]["views"] == 1
 
 
-def test_along_a_path_the_flicker_is_told(tmp_path: Path, capsys, folder: Path):
+def test_along_a_path_the_flicker_is_told(tmp_path: Path, capsys, folder: Path, monkeypatch):
     entries = [
         {"width": 32, "height": 24, "fx": 30, "fy": 30, "position": [0.05 * t, 0, -4],
          "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]} for t in range(4)
@@ -238,6 +249,11 @@ def test_along_a_path_the_flicker_is_told(tmp_path: Path, capsys, folder: Path):
     assert main(["compare", *map(str, words)]) == 0
     assert "along the path, 4 frames: flicker" in " ".join(capsys.readouterr().out.split())
     assert main(["compare", str(words[0]), str(words[1]), "--path"]) == 2
+    monkeypatch.setenv("PATH", str(tmp_path))
+    path = run(capsys, *words, "--path-metrics", "vmaf")["psnr"]["path"]
+    assert "ffmpeg with libvmaf" in path["video"]["not_available"]["vmaf"]
+    assert main(["compare", *map(str, words), "--path-metrics", "vmaf"]) == 0
+    assert "vmaf is not available: program-missing" in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_run_directory_brings_its_scene(tmp_path: Path, capsys, folder: Path):
@@ -288,6 +304,10 @@ def test_pictures_that_are_no_numbers_have_no_psnr():
 @pytest.mark.parametrize(("arguments", "told"), [
     (["{}/a.ply"], "give two files"), (["{}/a.ply", "{}/b.ply", "{}/a.ply"], "give two files"),
     (["{}/a.ply", "{}/none.ply"], "there is no such file"), (["{}/a.ply", "{}/b.ply", "--own"], "--own is for"),
+    (["{}/a.ply", "{}/b.ply", "--path-metrics", "vmaf"], "--path-metrics is for --path"),
+    (["{}/a.ply", "{}/b.ply", "--path-metrics", "vmaff"], "give some of cvvdp, vmaf"),
+    (["{}/a.ply", "{}/b.ply", "--metrics", "ssimm"], "did you mean 'ssim'"),
+    (["{}/a.ply", "{}/b.ply", "--metrics", "path_angle"], "it is not of pictures"),
     (["{}/a.ply", "{}"], "has no scene.swz"), (["{}/a.ply", "{}/b.ply", "--cameras", "{}/a.ply"], "not a JSON file"),
 ])  # fmt: skip
 def test_wrong_input_is_told_in_a_line(capsys, folder: Path, arguments: list[str], told: str):

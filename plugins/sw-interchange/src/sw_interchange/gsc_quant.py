@@ -75,7 +75,7 @@ class GscQuantCodec:
         """Write a section per attribute. Raises UserInputError for surfels, values that are not finite, and clipping
         with `range=fixed`."""
         refuse_surfels(model, "codec gsc-quant")
-        values = _values_of(model)
+        values = stored_values(model)
         ranges, auto = ranges_of(values, self.settings.range)
         bits, degree = self.settings.bits, model.active_sh_degree
         writer.raster["sh_degree"] = degree
@@ -83,7 +83,7 @@ class GscQuantCodec:
             num_gaussians=model.num_rows, sh_degree=degree, position_bits=self.settings.position_bits, bits=bits,
             range_auto=auto, ranges={name: [each.low.tolist(), each.high.tolist()] for name, each in ranges.items()},
         )  # fmt: skip
-        writer.allow(_decoded_bytes(model.num_rows, degree), f"a model of {model.num_rows:,} Gaussians")
+        writer.allow(decoded_bytes(model.num_rows, degree), f"a model of {model.num_rows:,} Gaussians")
         if not model.num_rows:
             return
         octree = self.plugins.position_codecs.load(POSITIONS)()
@@ -91,10 +91,10 @@ class GscQuantCodec:
         cells = ranges["position"].quantize(values["position"], self.settings.position_bits)
         order = octree.sort(cells)
         writer.add("position", octree.encode(cells[order], self.settings.position_bits))
-        for name, attribute in _attributes(degree).items():
+        for name, attribute in attributes_of(degree).items():
             found = values[name][order]
             spread = ranges[attribute]
-            codes = spread.quantize(found if name != "rotation" else _unit(found, spread, bits), bits)
+            codes = spread.quantize(found if name != "rotation" else unit_quaternions(found, spread, bits), bits)
             writer.add(name, columns.encode(codes, None))
 
     def decode(self, reader: ContainerReader) -> GaussianModel:
@@ -103,31 +103,35 @@ class GscQuantCodec:
         degree = reader.integer("sh_degree", low=0, high=3)
         position_bits = reader.integer("position_bits", low=4, high=21)
         bits = reader.integer("bits", low=2, high=20)
-        reader.allow(_decoded_bytes(count, degree), f"{count:,} Gaussians")
-        rest = (degree + 1) ** 2 - 1
+        reader.allow(decoded_bytes(count, degree), f"{count:,} Gaussians")
         if count == 0:
-            sizes = ((0, 3), (0, 1, 3), (0, rest, 3), (0,), (0, 3), (0, 4))
-            return GaussianModel.from_tensors(*(torch.zeros(size) for size in sizes))
-        ranges = _stated_ranges(reader)
+            return model_of({"position": np.zeros((0, 3))}, degree)
+        ranges = stated_ranges(reader)
         with reader.decoding("position") as data:
             cells = self.plugins.position_codecs.load(POSITIONS)(max_points=count).decode(data)
             if cells.shape != (count, 3) or not 0 <= int(cells.min()) <= int(cells.max()) < 1 << position_bits:
                 raise BitstreamError(f"holds {len(cells):,} points on another grid, the header says {count:,}")
         columns = self.plugins.entropy_models.load(COLUMNS)()
         found = {"position": ranges["position"].dequantize(cells, position_bits)}
-        for name, attribute in _attributes(degree).items():
+        for name, attribute in attributes_of(degree).items():
             with reader.decoding(name) as data:
-                codes = columns.decode(data, (count, _width(name)))
+                codes = columns.decode(data, (count, section_width(name)))
                 if not 0 <= int(codes.min()) <= int(codes.max()) < 1 << bits:
                     raise BitstreamError(f"a code has more than {bits} bits")
                 found[name] = ranges[attribute].dequantize(codes, bits)
-        bands = [found[f"sh{band}"].reshape(count, -1, 3) for band in range(1, degree + 1)]
-        bands = bands or [np.zeros((count, 0, 3))]
-        parts = (
-            found["position"], found["sh0"][:, None, :], np.concatenate(bands, axis=1), found["opacity"][:, 0],
-            found["scaling"], found["rotation"],
-        )  # fmt: skip
-        return GaussianModel.from_tensors(*(torch.from_numpy(part.astype(np.float32)) for part in parts))
+        return model_of(found, degree)
+
+
+def model_of(values: dict[str, Floats], degree: int) -> GaussianModel:
+    """The Gaussians of values [N,C] by section, which may lack sections where N is 0."""
+    n = len(values["position"])
+    found = {name: values.get(name, np.zeros((n, section_width(name)))) for name in attributes_of(degree)}
+    bands = [found[f"sh{band}"].reshape(n, 2 * band + 1, 3) for band in range(1, degree + 1)]
+    parts = (
+        values["position"], found["sh0"][:, None, :], np.concatenate([np.zeros((n, 0, 3)), *bands], axis=1),
+        found["opacity"][:, 0], found["scaling"], found["rotation"],
+    )  # fmt: skip
+    return GaussianModel.from_tensors(*(torch.from_numpy(part.astype(np.float32)) for part in parts))
 
 
 def ranges_of(values: dict[str, Floats], kind: str) -> tuple[dict[str, Range], list[str]]:
@@ -159,22 +163,22 @@ def ranges_of(values: dict[str, Floats], kind: str) -> tuple[dict[str, Range], l
 
 def clipped_attributes(model: GaussianModel) -> list[str]:
     """Attributes of a model that the table's ranges would clip, in the order of the table."""
-    return ranges_of(_values_of(model), "auto")[1]
+    return ranges_of(stored_values(model), "auto")[1]
 
 
 def _all_of(values: dict[str, Floats], attribute: str) -> Floats:
-    parts = [values[name].ravel() for name, of in _attributes(3).items() if of == attribute and name in values]
+    parts = [values[name].ravel() for name, of in attributes_of(3).items() if of == attribute and name in values]
     return np.concatenate(parts) if parts else np.zeros(0)
 
 
-def _values_of(model: GaussianModel) -> dict[str, Floats]:
+def stored_values(model: GaussianModel) -> dict[str, Floats]:
     """Values as the .ply of 3DGS stores them, [N,C] float64 by section. Raises UserInputError if one is not finite."""
     raw = {name: getattr(model, name).detach().cpu().double().numpy() for name in model.RAW}
     rest = raw["sh_rest"]
     found = {
         "position": raw["means"], "sh0": raw["sh_dc"][:, 0], "opacity": raw["opacity_logits"][:, None],
         "scaling": raw["log_scales"], "rotation": raw["quats"],
-        **{f"sh{band}": rest[:, band**2 - 1 : (band + 1) ** 2 - 1].reshape(-1, _width(f"sh{band}"))
+        **{f"sh{band}": rest[:, band**2 - 1 : (band + 1) ** 2 - 1].reshape(-1, section_width(f"sh{band}"))
            for band in range(1, model.active_sh_degree + 1)},
     }  # fmt: skip
     for name, values in found.items():
@@ -183,19 +187,20 @@ def _values_of(model: GaussianModel) -> dict[str, Floats]:
     return found
 
 
-def _attributes(degree: int) -> dict[str, str]:
+def attributes_of(degree: int) -> dict[str, str]:
     """Section -> attribute of the table, without the positions."""
     bands = {f"sh{band}": "sh" for band in range(degree + 1)}
     return {**bands, "opacity": "opacity", "scaling": "scale", "rotation": "quaternion"}
 
 
-def _width(section: str) -> int:
+def section_width(section: str) -> int:
+    """Columns of a section."""
     if section.startswith("sh"):
         return 3 * (2 * int(section[2:]) + 1)
     return {"opacity": 1, "scaling": 3, "rotation": 4}[section]
 
 
-def _unit(quats: Floats, spread: Range, bits: int) -> Floats:
+def unit_quaternions(quats: Floats, spread: Range, bits: int) -> Floats:
     """Unit quaternions [N,4]; decoded values of this lattice stay as they are, so that coding twice changes nothing."""
     length = np.linalg.norm(quats, axis=1, keepdims=True)
     step = float(spread.high - spread.low) / (2**bits - 1)
@@ -205,7 +210,7 @@ def _unit(quats: Floats, spread: Range, bits: int) -> Floats:
     return np.where(decoded, quats, np.where(length > 0, quats / np.where(length > 0, length, 1.0), identity))
 
 
-def _stated_ranges(reader: ContainerReader) -> dict[str, Range]:
+def stated_ranges(reader: ContainerReader) -> dict[str, Range]:
     """Ranges of the header. Raises BitstreamError unless each is two finite numbers, or of positions two of three."""
     stated = reader.static.get("ranges")
     found = {}
@@ -221,5 +226,6 @@ def _stated_ranges(reader: ContainerReader) -> dict[str, Range]:
     return found
 
 
-def _decoded_bytes(count: int, degree: int) -> int:
+def decoded_bytes(count: int, degree: int) -> int:
+    """Bytes of a decoded model."""
     return 4 * count * (14 + 3 * ((degree + 1) ** 2 - 1))

@@ -64,6 +64,10 @@ def register_methods(registry: Registry) -> None:
     registry.add("gsc-quant", "sw_interchange.methods:GscQuant", title="GSC quantiser", training_free=True,
                  summary="a trained 3DGS scene by the quantiser of the MPEG GSC exploration (2025), coded without loss",
                  presets=["paper", "quick"], rates=["r1", "r2", "r3", "r4", "r5"])  # fmt: skip
+    registry.add("tmc13", "sw_interchange.tmc13:Tmc13", title="TMC13", training_free=True,
+                 summary="a trained 3DGS scene through MPEG's program tmc3 for G-PCC, if SPLATWIZARD_TMC3 names it",
+                 available="sw_interchange.tmc3:unavailable",
+                 presets=["paper", "quick"], rates=["r1", "r2", "r3", "r4", "r5"])  # fmt: skip
 
 
 @hookimpl

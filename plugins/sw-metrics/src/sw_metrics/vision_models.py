@@ -11,7 +11,7 @@ import contextlib
 import importlib
 import importlib.metadata
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -61,22 +61,14 @@ class Packaged:
 
     def prepare(self, setup: MetricSetup) -> PreparedMetric:
         """The metric on the setup's device. Raises CapabilityError that says what to install."""
-        version = self.version()
-        if version is None:
-            raise CapabilityError(self._missing(), missing=[self.package])
-        with contextlib.suppress(ImportError):  # whoever needs it says so below
-            import_torchvision()  # piq and cvvdp import it
-        try:
-            module = importlib.import_module(self.module)
+        with self._imported() as module:
             compute, told = self.make(module, setup)
-        except ImportError as error:
-            raise CapabilityError(f"{self._missing()} ({error})", missing=[self.package]) from error
 
         def checked(render: Tensor, truth: Tensor) -> float:
             check_pair(render, truth)
             return compute(render.float(), truth.float())
 
-        return PreparedMetric(checked, {self.package: version, **told})
+        return PreparedMetric(checked, {self.package: str(self.version()), **told})
 
     def identity(self, setup: MetricSetup) -> str | None:
         """The package's version and the settings; None without the package."""
@@ -90,6 +82,18 @@ class Packaged:
             return importlib.metadata.version(self.package)
         except importlib.metadata.PackageNotFoundError:
             return None
+
+    @contextlib.contextmanager
+    def _imported(self) -> Iterator[Any]:
+        """The package's module. Raises CapabilityError where it, or what it imports inside, is not installed."""
+        if self.version() is None:
+            raise CapabilityError(self._missing(), missing=[self.package])
+        with contextlib.suppress(ImportError):  # whoever needs it says so below
+            import_torchvision()  # piq and cvvdp import it
+        try:
+            yield importlib.import_module(self.module)
+        except ImportError as error:
+            raise CapabilityError(f"{self._missing()} ({error})", missing=[self.package]) from error
 
     def _missing(self) -> str:
         return f"package-missing: {self.install}"
@@ -144,8 +148,25 @@ def _cvvdp(module: Any, setup: MetricSetup) -> tuple[Compute, Mapping[str, str]]
     return compute, {"display": display}
 
 
+class OfVideos(Packaged):
+    """ColorVideoVDP, which also takes videos."""
+
+    def of_video(
+        self, setup: MetricSetup, render: Tensor, truth: Tensor, *, fps: float
+    ) -> tuple[float, Mapping[str, str]]:
+        """JOD of a video [3,F,H,W] in 0..1 against another, and what it depends on.
+
+        Raises CapabilityError that says what to install.
+        """
+        display = setup.read(CvvdpSettings, "cvvdp").display
+        with self._imported() as module:
+            metric = module.cvvdp(display_name=display, heatmap=None, temp_padding="replicate")
+            found, _ = metric.predict(render[None], truth[None], dim_order="BCFHW", frames_per_second=fps)
+        return float(found), {self.package: str(self.version()), "display": display, "fps": f"{fps:g}"}
+
+
 FLIP = Packaged("pip install 'sw-metrics[flip]'", "flip-evaluator", "flip_evaluator", _flip)
-CVVDP = Packaged("pip install 'sw-metrics[cvvdp]'", "cvvdp", "pycvvdp", _cvvdp)
+CVVDP = OfVideos("pip install 'sw-metrics[cvvdp]'", "cvvdp", "pycvvdp", _cvvdp)
 MS_SSIM = of_piq(
     lambda piq, x, y: piq.multi_scale_ssim(x, y, kernel_size=11, kernel_sigma=1.5, data_range=1.0, k1=0.01, k2=0.03),
     "MS-SSIM",

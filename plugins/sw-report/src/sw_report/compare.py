@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +15,7 @@ from splatwizard_core.tooling import (
     device_option,
     images_option,
     json_option,
+    name_of,
     options,
     print_facts,
     scene_option,
@@ -28,6 +29,12 @@ if TYPE_CHECKING:
 
 MADE_UP = 12
 """Pictures where neither a scene nor cameras are given."""
+VIDEO_METRICS = ("cvvdp", "vmaf")
+"""Names of `sw_report.path_video`, which completion does not import: it would load torch."""
+
+
+def _video_words(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[str]:
+    return [name for name in VIDEO_METRICS if name.startswith(incomplete)]
 
 
 @click.command(short_help="two files; a run beside published figures")
@@ -40,8 +47,17 @@ MADE_UP = 12
         "scene 12 that are made up]",
     ),
     click.option(
+        "--metrics", metavar="NAME[,NAME]", type=name_of("metric"),
+        help="Metrics of pictures that B's are measured by against A's, such as ssim,flip.  [default: PSNR alone]",
+    ),
+    click.option(
         "--path", "is_path", is_flag=True,
         help="The cameras of --cameras are the frames of a path with a fixed step: tell of flicker and popping too.",
+    ),
+    click.option(
+        "--path-metrics", metavar="NAME[,NAME]", shell_complete=_video_words,
+        help="Models of vision of the path as a video, slow: cvvdp (sw-metrics[cvvdp]), vmaf (an ffmpeg with "
+        "libvmaf).  [default: none]",
     ),
     click.option("--published", is_flag=True, help="Compare runs with published figures of their data set and scene."),
     click.option("--own", is_flag=True, help="Published figures of the measured methods alone."),
@@ -51,7 +67,9 @@ MADE_UP = 12
 def compare(
     paths: tuple[Path, ...],
     cameras: Path | None,
+    metrics: str | None,
     is_path: bool,
+    path_metrics: str | None,
     published: bool,
     own: bool,
     as_json: bool,
@@ -77,7 +95,8 @@ def compare(
         raise click.UsageError("--own is for --published")
     if is_path and cameras is None:
         raise click.UsageError("--path is for --cameras FILE")
-    print_facts(_compared(paths[0], paths[1], cameras, chosen, is_path=is_path), as_json, _tell)
+    asked = _Asked(_names(metrics), is_path, _video_metrics(path_metrics, is_path))
+    print_facts(_compared(paths[0], paths[1], cameras, chosen, asked), as_json, _tell)
 
 
 def _beside_published(folders: tuple[Path, ...], own: bool, as_json: bool) -> None:
@@ -94,11 +113,36 @@ def _beside_published(folders: tuple[Path, ...], own: bool, as_json: bool) -> No
     print_facts({"tables": [to_dict(table) for table in tables], "notes": collection.notes}, as_json, told)
 
 
-def _compared(a: Path, b: Path, camera_file: Path | None, chosen: Choices, *, is_path: bool) -> dict[str, Any]:
+@dataclass(frozen=True)
+class _Asked:
+    """Wishes about the pictures besides PSNR: metrics by name, whether they are a path, and metrics of its video."""
+
+    metrics: tuple[str, ...]
+    is_path: bool
+    video: tuple[str, ...]
+
+
+def _names(text: str | None) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(name.strip() for name in (text or "").split(",") if name.strip()))
+
+
+def _video_metrics(text: str | None, is_path: bool) -> tuple[str, ...]:
+    """Names of --path-metrics. Raises click.UsageError for others, and without --path."""
+    names = _names(text)
+    if unknown := [name for name in names if name not in VIDEO_METRICS]:
+        raise click.UsageError(f"--path-metrics {unknown[0]}: give some of {', '.join(VIDEO_METRICS)}")
+    if text is not None and not (is_path and names):
+        raise click.UsageError(f"--path-metrics is for --path, with some of {', '.join(VIDEO_METRICS)}")
+    return names
+
+
+def _compared(a: Path, b: Path, camera_file: Path | None, chosen: Choices, asked: _Asked) -> dict[str, Any]:
     from splatwizard_core.api import GaussianModel, UserInputError
     from splatwizard_core.tooling import load_plugins, open_session
     from sw_report.attribute_errors import attribute_errors
+    from sw_report.compared_metrics import PictureMetrics
     from sw_report.compared_models import compare_pictures, open_file
+    from sw_report.path_video import PathVideo
 
     configs = [path / "config.toml" for path in (a, b) if (path / "config.toml").is_file()]
     of_runs = [replace(chosen, config_file=str(config)).resolve_without_method() for config in configs]
@@ -111,6 +155,7 @@ def _compared(a: Path, b: Path, camera_file: Path | None, chosen: Choices, *, is
     resolved = of_runs[0] if of_runs else chosen.resolve_without_method()
     session = open_session(resolved, load_plugins())
     scene = session.scene(resolved) if chosen.scene is not None or configs else None
+    metrics = PictureMetrics(asked.metrics, session.plugins, session.device, resolved.metrics)
     left, right = (open_file(path, session, resolved, scene) for path in (a, b))
     test = [] if scene is None or camera_file is not None else scene.test
     places, seen_from = [view.camera for view in test], f"test views of {scene.name}" if scene is not None else ""
@@ -121,13 +166,18 @@ def _compared(a: Path, b: Path, camera_file: Path | None, chosen: Choices, *, is
     if isinstance(left.model, GaussianModel) and isinstance(right.model, GaussianModel):
         errors = attribute_errors(left.model, right.model)
     reason = None if errors else "no finite Gaussians" if explicit else "the Gaussians depend on the camera"
+    video = PathVideo(asked.video, session.plugins, resolved.metrics) if asked.video else None
+    pictures = compare_pictures(
+        left, right, places, _with_pictures(test), is_path=asked.is_path, video=video, metrics=metrics
+    )
     return {
         "a": left.facts(),
         "b": right.facts(),
         "attributes": errors and errors.as_dict(),
         "no_attributes": reason,
         "cameras": seen_from,
-        "psnr": compare_pictures(left, right, places, _with_pictures(test), is_path=is_path),
+        "psnr": pictures,
+        "metrics": metrics.result(),
     }
 
 
@@ -151,6 +201,11 @@ def _with_pictures(views: list[View]) -> list[View] | None:
     return views if views and all(view.load is not None for view in views) else None
 
 
+def _told_of_video(found: dict[str, Any]) -> list[str]:
+    lines = [f"{name} of the video: {found[name]:.2f} ({made})" for name, made in found.get("made_with", {}).items()]
+    return lines + [f"{name} is not available: {why}" for name, why in found.get("not_available", {}).items()]
+
+
 def _tell(facts: dict[str, Any]) -> None:
     from splatwizard_core.tooling import print_table
 
@@ -164,13 +219,18 @@ def _tell(facts: dict[str, Any]) -> None:
     print_table(["", "A", "B"], rows)
     seen = f"{psnr['views']} cameras ({facts['cameras']})"
     click.echo(f"B against A: {psnr['mean']:.2f} dB, at least {psnr['least']:.2f} dB, from {seen}")
+    for name, found in facts["metrics"].items():
+        value = "not available: " + found.get("reason", "") if found["mean"] is None else f"{found['mean']:.4f}"
+        click.echo(f"{name} of B against A: {value}")
     if "path" in psnr:
         path = psnr["path"]
-        told = {name: "-" if path[name] is None else f"{path[name]:.3g}" for name in path}
+        told = {name: "-" if value is None else f"{value:.3g}" for name, value in path.items() if name != "video"}
         click.echo(
             f"along the path, {told['frames']} frames: flicker {told['flicker']} levels (of first differences "
             f"{told['flicker1']}), PSNR {told['psnr']} dB, popping {told['popping_a']} of A, {told['popping_b']} of B"
         )
+        for line in _told_of_video(path.get("video", {})):
+            click.echo(line)
     if attributes is None:
         click.echo(f"no errors of attributes: {facts['no_attributes']}")
         return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,7 +23,9 @@ from splatwizard_core.tooling import (
     render_view,
     suggested_rasterizers,
 )
+from sw_report.compared_metrics import PictureMetrics
 from sw_report.path_flicker import PathFlicker
+from sw_report.path_video import PathVideo
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Scene, View
@@ -82,29 +85,46 @@ def open_file(path: Path, session: Session, resolved: ResolvedConfig, scene: Sce
 
 
 def compare_pictures(
-    a: OpenedFile, b: OpenedFile, cameras: list[Camera], views: list[View] | None, *, is_path: bool = False
+    a: OpenedFile,
+    b: OpenedFile,
+    cameras: list[Camera],
+    views: list[View] | None,
+    *,
+    is_path: bool = False,
+    video: PathVideo | None = None,
+    metrics: PictureMetrics | None = None,
 ) -> dict[str, Any]:
     """PSNR of B against A, mean and least over the cameras, dB; with `views` also of each against its pictures.
 
     views   whose cameras they are, with pictures, or None
     is_path the cameras are frames of a path with a fixed step: `path` tells of flicker and popping
+    video   measures the path as a video
+    metrics takes every pair of pictures besides
     """
     path = PathFlicker()
     between, to_truth = [], ([], [])  # type: tuple[list[float], tuple[list[float], list[float]]]
-    with track("compare", total=len(cameras), unit="views") as bar:
+    with contextlib.ExitStack() as stack:
+        bar = stack.enter_context(track("compare", total=len(cameras), unit="views"))
+        frames = stack.enter_context(video) if video is not None else None
         for i, camera in enumerate(cameras):
             pictures = a.picture(camera), b.picture(camera)
             between.append(capped_psnr(*pictures))
+            if metrics is not None:
+                metrics.add(*pictures)
             if is_path:
                 path.add(*pictures)
+            if frames is not None:
+                frames.add(*pictures)
             if views is not None:
                 truth = views[i].image(a.options.background, a.model.device)
                 for values, picture in zip(to_truth, pictures, strict=True):
                     values.append(capped_psnr(picture, truth))
             bar.advance()
-    found: dict[str, Any] = {"views": len(cameras), "mean": _mean(between), "least": min(between)}
-    if is_path:
-        found["path"] = path.result()
+        found: dict[str, Any] = {"views": len(cameras), "mean": _mean(between), "least": min(between)}
+        if is_path:
+            found["path"] = path.result()
+        if frames is not None:
+            found["path"]["video"] = frames.result()
     if views is not None:
         found |= {"a_to_pictures": _mean(to_truth[0]), "b_to_pictures": _mean(to_truth[1])}
     return found

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +21,7 @@ from splatwizard_core.tooling import DATA_VARIABLE
 HIDDEN = (DATA_VARIABLE, "SPLATWIZARD_TEST_DATA")
 """Environment of data sets, which a decoder must not see."""
 REASON = 300  # characters
+LOOK = 0.01  # s between looks at the size of a process
 
 
 class CodecFailedError(SplatwizardError):
@@ -101,11 +105,14 @@ def run(words: list[str], folder: Path) -> tuple[dict[str, Any], float | None]:
 
 
 def _peak_of(process: subprocess.Popen[bytes]) -> float | None:
-    """Wait for a process; its peak resident set, 10^6 bytes, where the system tells it of one process."""
-    if not hasattr(os, "wait4"):
-        process.wait()
-        return None
-    _, status, usage = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    unit = 1 if sys.platform == "darwin" else 1024
-    return usage.ru_maxrss * unit / 1e6
+    """Wait for a process; its peak resident set, 10^6 bytes, where the system tells it (Linux).
+
+    Looks at it while it runs: what the kernel says of a process that has ended counts its parent's size before `exec`.
+    """
+    status, peak = Path(f"/proc/{process.pid}/status"), 0
+    while process.poll() is None:
+        with contextlib.suppress(OSError):
+            found = re.search(r"^VmHWM:\s*(\d+)", status.read_text(), re.MULTILINE)
+            peak = max(peak, int(found[1]) if found is not None else 0)
+        time.sleep(LOOK)
+    return peak * 1024 / 1e6 if peak else None

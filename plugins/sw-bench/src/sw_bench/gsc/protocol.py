@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import json
 import re
 from collections.abc import Sequence
@@ -28,6 +29,7 @@ from splatwizard_core.api import (
 )
 from splatwizard_core.tooling import (
     Entry,
+    PluginManager,
     ResolvedConfig,
     Session,
     file_sha256,
@@ -125,7 +127,8 @@ def bench_gsc(plan: Plan, session: Session, resolved: ResolvedConfig) -> dict[st
         sources = [first | {"frames": sources, "splats": sum(each["splats"] for each in sources)}]
     rows.sort(key=lambda row: (row["sequence"], row["codec"], row["rate"]))
     bd = bd_rows(rows, plan.anchor)
-    found = {"protocol": TITLE, "anchor": plan.anchor, "sources": sources, "rows": rows, "bd": bd}
+    found = {"protocol": TITLE, "anchor": plan.anchor, "sources": sources, "rows": rows, "bd": bd,
+             "not_available": {} if plan.codecs else not_available(session.plugins)}  # fmt: skip
     write_json(plan.out / "gsc.json", found)
     write_atomic(plan.out / "gsc.csv", csv_text(COLUMNS, rows))
     write_atomic(plan.out / "gsc_bd.csv", csv_text(BD_COLUMNS, bd))
@@ -133,14 +136,36 @@ def bench_gsc(plan: Plan, session: Session, resolved: ResolvedConfig) -> dict[st
 
 
 def codecs_of(plan: Plan, session: Session) -> list[Entry]:
-    """The codecs that are asked for, or all that need no training; the anchor among them. Raises UserInputError."""
+    """The codecs that are asked for, or all that need no training and can be used here; the anchor among them.
+
+    Raises UserInputError for one that trains, CapabilityError for one that is asked for and cannot be used.
+    """
     methods = session.plugins.methods
-    wanted = list(plan.codecs) or [entry.name for entry in methods if entry.declared.get("training_free")]
+    absent = not_available(session.plugins)
+    wanted = list(plan.codecs)
+    if not wanted:
+        wanted = [e.name for e in methods if e.declared.get("training_free") and e.name not in absent]
+        for name, reason in absent.items():
+            say(f"{name} is left out: {reason}")
     if plan.anchor not in wanted and plan.anchor in methods:
         wanted.append(plan.anchor)
     found = [methods.entry(name) for name in dict.fromkeys(wanted)]
     if others := [entry.name for entry in found if not entry.declared.get("training_free")]:
         raise UserInputError(f"{', '.join(others)} has to train, and this protocol is for what need not")
+    for entry in found:
+        if entry.name in absent:
+            raise CapabilityError(f"{entry.name}: {absent[entry.name]}")
+    return found
+
+
+def not_available(plugins: PluginManager) -> dict[str, str]:
+    """Codecs that train nothing and cannot be used here, with the reason that the probe they declare gives."""
+    found = {}
+    for entry in plugins.methods:
+        module, _, function = str(entry.declared.get("available", "")).partition(":")
+        if entry.declared.get("training_free") and module:
+            reason = getattr(importlib.import_module(module), function)()
+            found |= {} if reason is None else {entry.name: reason}
     return found
 
 

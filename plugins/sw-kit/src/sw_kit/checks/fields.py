@@ -66,7 +66,7 @@ METRIC: dict[str, Rule] = {
 FIELDS: Mapping[str, Mapping[str, Rule]] = {
     "method": {
         "presets": NAMES, "rates": NAMES, "bd_anchor": COUNT, "default": FLAG, "published": FIGURES, "title": TEXT,
-        "prefixes": SETTING, "training_free": FLAG,
+        "prefixes": SETTING, "training_free": FLAG, "available": WHERE,
     },
     "metric": METRIC,
     "coder": {"codes": CODES, "available": WHERE, "stores": TEXT, "prefixes": SETTING},
