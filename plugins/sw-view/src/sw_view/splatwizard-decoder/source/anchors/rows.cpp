@@ -4,6 +4,7 @@
 #include <range_coded.h>
 
 #include "chunks.h"
+#include "escapes.h"
 
 namespace swz {
 
@@ -15,40 +16,6 @@ using splatwizard::SYMBOL_LIMIT;
 constexpr splatwizard::Parallel ALONE;
 constexpr int TABLES = 512;
 constexpr int64_t WIDTHS[] = {4, 6, 8, 12, 16, 24, 32, 48, 64, 128, 256};
-
-template <class T>
-T magnitude(T x) {
-  return x < 0 ? -x : x;
-}
-
-// Escape codes behind coded words, of which the length says nothing else.
-struct Escapes {
-  arch_native::EscapeReader bits;
-
-  Escapes(Bytes data, int64_t count) : bits(data.data, data.left) {
-    if (count > 4 * data.left)
-      refuse(grouped(data.left), " bytes cannot hold ", grouped(count), " escape codes: the data is truncated");
-  }
-  // What is beyond a radius, signed.
-  int64_t beyond(int64_t radius) {
-    const int64_t found = bits.beyond(radius);
-    if (bits.damaged) refuse("an escape code is damaged or truncated");
-    too_large |= magnitude(found) - radius > 2 * SYMBOL_LIMIT;
-    return found;
-  }
-  void finish() const {
-    if (!bits.used_up()) refuse("unknown bits follow the escape codes");
-    if (too_large) refuse("an escaped symbol is beyond 2^30");
-  }
-
- private:
-  bool too_large = false;
-};
-
-Bytes whole_words(Bytes words) {
-  if (words.left % 4) refuse(grouped(words.left), " coded bytes are not whole 32-bit words");
-  return words;
-}
 
 // Numbers of a block that are present, and where those of each row begin.
 struct Present {
@@ -130,15 +97,8 @@ void RowDecoder::version_1(Bytes data, const int32_t* centre, const int16_t* num
     const splatwizard::RangeSession session{words.data, words.left, state};
     session.store(reader);
     if (arch_native::range_entries(session, tables.gaussian.tables(), number, n, symbols)) refuse(DAMAGED_WORDS);
-    int64_t escaped = 0, per_table[TABLES + 1] = {};
-    const auto is_escape = [&](int64_t i) { return symbols[i] > 2 * radii[number[i]]; };
-    for (int64_t i = 0; i < n; ++i)
-      if (is_escape(i)) ++per_table[number[i] + 1], ++escaped;
-    for (int t = 0; t < TABLES; ++t) per_table[t + 1] += per_table[t];
-    Buffer<int64_t> order(escaped);
-    for (int64_t i = 0; i < n; ++i)
-      if (is_escape(i)) order[per_table[number[i]]++] = i;
-    Escapes codes(payload, escaped);
+    const Buffer<int64_t> escaped = escaped_rows(symbols, number, n, radii);
+    Escapes codes(payload, escaped.size);
     int64_t least = INT64_MAX, most = INT64_MIN;
     const auto settle = [&](int64_t at, int64_t offset) {
       const int64_t value = offset + centre[at];
@@ -147,8 +107,8 @@ void RowDecoder::version_1(Bytes data, const int32_t* centre, const int16_t* num
       symbols[at] = static_cast<int32_t>(value);
     };
     for (int64_t i = 0; i < n; ++i)
-      if (!is_escape(i)) settle(i, symbols[i] - radii[number[i]]);
-    for (int64_t i = 0; i < escaped; ++i) settle(order[i], codes.beyond(radii[number[order[i]]]));
+      if (symbols[i] <= 2 * radii[number[i]]) settle(i, symbols[i] - radii[number[i]]);
+    for (int64_t i = 0; i < escaped.size; ++i) settle(escaped[i], codes.beyond(radii[number[escaped[i]]]));
     codes.finish();
     if (least != head.low || most != head.high || crc32(symbols, 4 * n) != head.crc) refuse(WRONG_CONTEXT);
   }
