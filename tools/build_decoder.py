@@ -29,14 +29,16 @@ ALONE = FOLDER / "source" / "alone"
 SHARED = Path("splatwizard-native/src/splatwizard_native/include")
 TABLES = Path("plugins/sw-codecs/src/sw_codecs/data/exact_tables.bin")
 WISP = Path("plugins/sw-wisp/src/sw_wisp")
+ANCHORS = Path("plugins/sw-anchors/src")
 ZIGLANG = "0.17.1"
 MOST_MEMORY = 1 << 30
 STACK = 1 << 20
-INCLUDES = (KERNELS, WISP, ALONE, FOLDER / "source", SHARED)
+INCLUDES = (KERNELS, WISP, ALONE, FOLDER / "source", ANCHORS, SHARED)
 FLAGS = (
     "-target", "wasm32-wasi", "-mexec-model=reactor", "-std=c++20", "-Os", "-msimd128", "-ffp-contract=off",
     "-fno-rtti", "-s", "-DSW_ARCH=arch_native", f"-Wl,--max-memory={MOST_MEMORY}", f"-Wl,-z,stack-size={STACK}",
     "-I", str(ALONE), "-isystem", str(SHARED), "-I", str(KERNELS), "-I", str(WISP), "-I", str(FOLDER / "source"),
+    "-I", str(ANCHORS),
 )  # fmt: skip
 INCLUDE = re.compile(r'^#include ["<]([\w./]+)[">]', re.MULTILINE)
 OF_ALL = (
@@ -45,7 +47,9 @@ OF_ALL = (
 )  # fmt: skip
 """Files of source/ that every module has; what none of its methods calls is left out of it."""
 KERNELS_OF_ALL = ("octree.cpp", "network.cpp", "sessions.cpp")
-KERNELS_OF_ANCHORS = ("bits.cpp", "streams.cpp", "lattice.cpp", "lookups.cpp", "mixtures.cpp", "mixture_rows.cpp", "planes.cpp")
+KERNELS_OF_ANCHORS = (
+    "bits.cpp", "streams.cpp", "lattice.cpp", "lookups.cpp", "mixtures.cpp", "mixture_rows.cpp", "planes.cpp",
+)  # fmt: skip
 MODULES = ("decoder.wasm", "anchors.wasm")
 """What is built: explicit Gaussians and wisp; anchor methods."""
 
@@ -55,7 +59,8 @@ def sources(module: str) -> list[Path]:
     kernels = [KERNELS / name for name in KERNELS_OF_ALL]
     if module == "anchors.wasm":
         shared = [FOLDER / "source" / name for name in OF_ALL]
-        return [*shared, *_sources_in("source/anchors"), *kernels, *(KERNELS / name for name in KERNELS_OF_ANCHORS)]
+        kernels += [*(KERNELS / name for name in KERNELS_OF_ANCHORS), ANCHORS / "sw_anchors" / "kernels" / "heads.cpp"]
+        return [*shared, *_sources_in("source/anchors"), *kernels]
     return [*_sources_in("source"), *kernels, KERNELS / "leaf_octree.cpp", WISP / "exact_kernels" / "pyramid.cpp"]
 
 

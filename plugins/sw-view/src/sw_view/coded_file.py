@@ -26,7 +26,9 @@ METHODS = (
 CODECS = (
     "gaussians-exact", "gaussians-quantized", "gaussians-zstd", "gaussians-ply", "vectree", "gaussians-indexed", "raht",
 )  # fmt: skip
-WITH_TABLES = ("wisp",)
+OF_ANCHORS = ("hac", "hac-plus", "cat-3dgs")
+"""Methods whose files anchors.wasm knows, in mode `exact`."""
+WITH_TABLES = ("wisp", *OF_ANCHORS)
 """Methods whose files are decoded by the exact tables (module.js)."""
 MODES = ("exact", "quantized")
 """Of `3dgs`, in place of a codec."""
@@ -46,6 +48,8 @@ def covers(reader: ContainerReader) -> bool:
         return False
     if any(reader.section(name)[:1] != b"\1" for name in VECTORS if name in reader):
         return False
+    if reader.method in OF_ANCHORS:
+        return static.get("mode") == "exact"
     if reader.method in ("chimerags", "wisp"):
         return True
     codec, mode = static.get("codec"), static.get("mode")

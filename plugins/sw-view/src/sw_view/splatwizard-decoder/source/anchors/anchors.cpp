@@ -10,6 +10,8 @@ namespace {
 
 constexpr int64_t TOP = 65535, FIELDS = 12;
 
+}  // namespace
+
 const char* joined(const char* first, const char* second) {
   const size_t a = std::strlen(first), b = std::strlen(second);
   auto* text = static_cast<char*>(std::malloc(a + b + 1));
@@ -18,8 +20,6 @@ const char* joined(const char* first, const char* second) {
   std::memcpy(text + a, second, b + 1);
   return text;
 }
-
-}  // namespace
 
 IntegerList::IntegerList(const Container& file, const char* key, int64_t low, int64_t high, int64_t longest,
                          int64_t shortest) {

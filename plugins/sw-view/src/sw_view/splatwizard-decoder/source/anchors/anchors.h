@@ -72,6 +72,7 @@ int64_t networks_of_anchors(const Shape& shape, int64_t hidden);  // numbers of 
 // Factors of the outputs of a context network, [shape.outputs()]: means and scales come in base steps.
 void put_units(const Shape& shape, const double* base_steps, double* units);
 
+const char* joined(const char* first, const char* second);
 const char* numbered(const char* name, int64_t number);  // name and digits
 
 // A section as blocks.
