@@ -185,6 +185,18 @@ def test_a_page_holds_the_file_where_that_is_smaller(monkeypatch, name):
     assert with_file(model, packed) is packed
 
 
+def test_a_page_of_anchors_holds_their_file_and_says_how_many(tmp_path, capsys):
+    file, page = GOLDEN / "hac_exact_v2.swz", tmp_path / "x.html"
+    assert main(["view", str(file), "--html", str(page)]) == 0
+    text, facts = page.read_text("utf-8"), facts_of(page)
+    (held,) = re.findall(r'<script type="text/plain" id="gaussians">(.*?)</script>', text)
+    (module,) = re.findall(r'<script type="text/plain" id="wasm">(.*?)</script>', text)
+    assert base64.b64decode(held) == file.read_bytes()
+    assert zlib.decompress(base64.b64decode(module)) == (coded_file.FOLDER / "anchors.wasm").read_bytes()
+    assert (facts["anchors"], facts["count"], facts["degree"]) == (40, 101, 0)
+    assert "<span>101 Gaussians</span><span>of 40 anchors</span>" in text
+
+
 @pytest.mark.parametrize("change", [{"world_origin": [1.0, 0.0, 0.0]}, {"file": "gone.swz"}, {"left_out": {"some": 1}}])
 def test_a_model_that_is_not_that_of_its_file_is_packed(monkeypatch, change):
     model = of_file("3dgs_classes_v1")

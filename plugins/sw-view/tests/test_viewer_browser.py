@@ -21,7 +21,7 @@ import torch
 from headless_chromium import WEBGL, Chromium, find_chromium
 from PIL import Image
 from sw_gaussians.surfels import gaussians_of
-from sw_view.entries import Opened, find_entries, open_entry
+from sw_view.entries import Opened, about_page, find_entries, for_page, open_entry
 from sw_view.packing import pack
 from sw_view.page_file import About, write_page, write_pair
 from sw_view.shown_cameras import surroundings_of
@@ -78,6 +78,10 @@ def still(browser: Chromium, page: Path, camera: int, size: tuple[int, int]) -> 
     browser.send("Page.navigate", url="about:blank")  # a change of the fragment alone would load nothing
     browser.open(at(f"{page.as_uri()}#camera={camera}&size={size[0]}x{size[1]}&still"), width=1280)
     wait_for(browser, f"document.title === 'still {camera}'")
+    return canvas_of(browser)
+
+
+def canvas_of(browser: Chromium) -> np.ndarray:
     data = browser.ask("document.getElementById('canvas').toDataURL()").partition(",")[2]
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"), np.float64) / 255
 
@@ -165,8 +169,8 @@ def test_a_file_with_cuts_is_shown_coarse_first(browser, tmp_path, monkeypatch, 
     with monkeypatch.context() as patched:
         patched.setattr("sw_view.page_file.pack", lambda _: replace(packed, text="a" * 400_000))
         write_page(model, pages[0], About("toy"), None)
-    slow = pages[0].read_text().replace("tell(0, true);", "setTimeout(() => tell(0, true), 500);")
-    pages[0].write_text(slow)
+    pause = "await new Promise(r => setTimeout(r, 500)); tell(decoded(0),"
+    pages[0].write_text(pages[0].read_text().replace("tell(decoded(0),", pause))
     added = browser.send("Page.addScriptToEvaluateOnNewDocument", source=NOTES_STATES)
     browser.open(at(pages[0].as_uri()), width=800)
     wait_for(browser, "document.documentElement.dataset.state === 'drawn'")
@@ -175,6 +179,25 @@ def test_a_file_with_cuts_is_shown_coarse_first(browser, tmp_path, monkeypatch, 
     assert states[0] == first
     assert states[-1] == "drawn"
     assert psnr(*(still(browser, page, 0, (160, 120)) for page in pages)) > 45
+
+
+@pytest.mark.parametrize("name", ["hac_half_v2", "hac_plus_v1", "cat_3dgs_refined_v2"])
+def test_anchors_are_evaluated_wherever_the_eye_comes_to_rest(browser, tmp_path, name):
+    opened = open_entry(find_entries(GOLDEN / f"{name}.swz")[0], Choices(), load_plugins())
+    page, (packed, note) = tmp_path / "anchors.html", for_page(opened)
+    write_page(packed, page, about_page(opened), opened.around)
+    assert note.startswith("The method's Gaussians depend on the camera")
+
+    def of_rasterizer(camera: Camera) -> np.ndarray:
+        return opened.drawing.render(camera).image.clamp(0, 1).permute(1, 2, 0).numpy()
+
+    cameras = [each.camera.resized(240, 180) for each in opened.around.cameras]
+    assert psnr(*map(of_rasterizer, (cameras[0], cameras[3]))) < 42  # two pictures, not one twice
+    assert psnr(still(browser, page, 0, (240, 180)), of_rasterizer(cameras[0])) > 45
+    browser.ask("(l => { l.value = 3; l.dispatchEvent(new Event('change')); })(document.getElementById('camera'))")
+    wait_for(browser, "document.title === 'still 3'")
+    assert psnr(canvas_of(browser), of_rasterizer(cameras[3])) > 45
+    assert all(url.startswith("blob:") for url in browser.requests()[1:])
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2])

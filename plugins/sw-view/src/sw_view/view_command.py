@@ -86,7 +86,7 @@ def view(
 
 
 def _write_page(paths: Sequence[Path], page: Path, as_json: bool, chosen: Choices) -> None:
-    from sw_view.entries import about_page, find_all_entries, fixed_gaussians, open_entry
+    from sw_view.entries import about_page, find_all_entries, for_page, open_entry
     from sw_view.page_file import write_page, write_pair
 
     plugins, entries = load_plugins(), find_all_entries(paths)
@@ -96,7 +96,7 @@ def _write_page(paths: Sequence[Path], page: Path, as_json: bool, chosen: Choice
         )
     opened = [open_entry(entry, chosen, plugins) for entry in entries.values()]
     models = [(model, replace(about_page(each), note=note)) for each in opened
-              for model, note in [fixed_gaussians(each)]]  # fmt: skip
+              for model, note in [for_page(each)]]  # fmt: skip
     around = next((each.around for each in opened if each.has_scene), opened[0].around)
     if len(models) == 1:
         write_page(models[0][0], page, models[0][1], around)
