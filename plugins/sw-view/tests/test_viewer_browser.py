@@ -24,6 +24,7 @@ from sw_gaussians.surfels import gaussians_of
 from sw_view.entries import Opened, about_page, find_entries, for_page, open_entry
 from sw_view.packing import pack
 from sw_view.page_file import About, write_page, write_pair
+from sw_view.photographs import photographs_of
 from sw_view.shown_cameras import surroundings_of
 from sw_view.shown_models import shown_model
 
@@ -259,6 +260,39 @@ def test_controls_move_the_eye_and_cameras_bring_it_back(browser, scene, model, 
     assert not [line for line in browser.complaints() if "ReadPixels" not in line]
 
 
+def test_a_photograph_lies_over_the_picture_of_its_camera_alone(browser, scene, model, tmp_path):
+    page, around = tmp_path / "scene.html", surroundings_of(scene)
+    write_page(model, page, About("toy", photographs=photographs_of(around.cameras, 1)), around)
+    browser.send("Page.navigate", url="about:blank")
+    browser.open(page, width=900, height=700)
+    wait_for(browser, "document.documentElement.dataset.state === 'drawn'")
+    seen = "!document.getElementById('photo').hidden && !document.getElementById('border').hidden"
+    assert not browser.ask(seen)
+    browser.key("p", 80)
+    assert browser.ask(seen)
+    slide = "s => { s.value = 0; s.dispatchEvent(new Event('input')); }"
+    browser.ask(f"({slide})(document.getElementById('border'))")
+    wait_for(browser, "document.documentElement.dataset.state === 'drawn'")
+    box = browser.ask("(({x, y, width, height}) => ({x, y, width, height}))"
+                      "(document.getElementById('canvas').getBoundingClientRect())")  # fmt: skip
+    camera = around.cameras[0].camera
+    fit = min(box["width"] / camera.width, box["height"] / camera.height)
+    size = (camera.width * fit, camera.height * fit)
+    clip = {"x": box["x"] + (box["width"] - size[0]) / 2, "y": box["y"] + (box["height"] - size[1]) / 2,
+            "width": size[0], "height": 0.9 * size[1]}  # fmt: skip
+    browser.picture(tmp_path / "photo.png", whole=False, clip=clip)
+    shown = Image.open(tmp_path / "photo.png").convert("RGB").resize((camera.width, round(0.9 * camera.height)))
+    photograph = scene.test[0].image().permute(1, 2, 0).numpy()[: shown.height]
+    assert psnr(np.asarray(shown, np.float64) / 255, photograph) > 25  # scaled twice, and a JPEG
+    browser.key("ArrowRight", 39)
+    assert not browser.ask(seen)
+    browser.key("r", 82)
+    assert browser.ask(seen)
+    browser.key("]", 221)  # which has none
+    assert not browser.ask(seen)
+    assert browser.ask("document.getElementById('photograph').hidden")
+
+
 def test_both_halves_of_a_page_of_two_are_drawn_and_move_together(browser, scene, model, tmp_path):
     """By what the window shows, against the page of each model alone in a window of its half."""
     grey = GaussianModel(model.means, torch.ones_like(model.sh_dc), torch.zeros_like(model.sh_rest),
@@ -269,8 +303,8 @@ def test_both_halves_of_a_page_of_two_are_drawn_and_move_together(browser, scene
         write_page(each, page, about, around)
     write_pair(titled, pages[2], around)
 
-    def shown(page: Path, width: int, camera: int | None = None) -> np.ndarray:
-        browser.open(page, width=width, height=700)
+    def shown(page: Path, width: int, camera: int | None = None, height: int = 700) -> np.ndarray:
+        browser.open(page, width=width, height=height)
         documents = "[document, ...[...document.querySelectorAll('iframe')].map(f => f.contentDocument)]"
         documents = f"{documents}.filter(d => d.getElementById('canvas'))"
         settled = f"{documents}.every(d => d.documentElement.dataset.state === 'drawn')"
@@ -286,12 +320,13 @@ def test_both_halves_of_a_page_of_two_are_drawn_and_move_together(browser, scene
 
     for camera in (None, 1):
         both = shown(pages[2], 1280, camera)
+        height = 700 - browser.ask("document.getElementById('tools').offsetHeight")
         for alone, half in zip(pages, (both[:, :639], both[:, 641:]), strict=False):
             assert half.std() > 0.05
-            assert psnr(half, shown(alone, 639, camera)) > 40
+            assert psnr(half, shown(alone, 639, camera, height)) > 40
     assert psnr(both[:, :639], both[:, 641:]) < 25  # two models, not one twice
 
-    wide = [shown(page, 1280, 1) for page in pages[:2]]
+    wide = [shown(page, 1280, 1, height) for page in pages[:2]]
     shown(pages[2], 1280, 1)
     slide = "s => { s.value = 25; s.dispatchEvent(new Event('input')); }"
     browser.ask(f"document.getElementById('over').click(), ({slide})(document.getElementById('share'))")

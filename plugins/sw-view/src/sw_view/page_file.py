@@ -11,8 +11,8 @@ import hashlib
 import html
 import json
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,7 @@ class About:
     eps2d       low-pass, px^2
     antialias   whether opacities are compensated for it
     note        a sentence for the help, about the cameras or the model
+    photographs data: URIs of pictures by the place of their camera
     """
 
     title: str
@@ -56,6 +57,7 @@ class About:
     eps2d: float = 0.3
     antialias: bool = False
     note: str = ""
+    photographs: Mapping[int, str] = field(default_factory=dict)
 
 
 def write_page(
@@ -108,7 +110,10 @@ def _page(packed: Packed, about: About, around: Surroundings) -> str:
         **packed.facts,
         "background": about.background, "eps2d": about.eps2d, "antialias": int(about.antialias),
         "near": around.cameras[0].camera.near, "up": _numbers(around.up), "pivot": _numbers(around.pivot),
-        "size": around.size, "cameras": [_camera(each) for each in around.cameras],
+        "size": around.size, "cameras": [
+            _camera(each) | ({"photo": about.photographs[i]} if i in about.photographs else {})
+            for i, each in enumerate(around.cameras)
+        ],
     }  # fmt: skip
     told = [f"{packed.facts['count']:,} Gaussians"]
     told += [f"of {packed.facts['anchors']:,} anchors"] if "anchors" in packed.facts else []

@@ -27,7 +27,9 @@ function begin(gaussians, { whole, look, eye: seenFrom }) {
   let hearing = true;  // also until the eye is there
   let next = null;  // Gaussians whose order is not there yet
   let looking = null, resting = 0;  // the place that Gaussians are asked for; a timer
-  const eye = new Eye(facts, () => { wanted = true; again(); watch(); if (!hearing) parent.postMessage(eye.place, '*'); });
+  const photo = find('photo'), border = find('border'), toggle = find('photograph');
+  let standing = '';  // the pose of the camera that was chosen last
+  const eye = new Eye(facts, () => { wanted = true; again(); watch(); compare(); if (!hearing) parent.postMessage(eye.place, '*'); });
   const isElsewhere = () => Boolean(look) && eye.eye.some((x, k) => x !== seenFrom[k]);
   hearing = parent === window;
   if (!hearing) addEventListener('message', ({ data, source }) => {  // beside another model: both look from one place
@@ -36,6 +38,12 @@ function begin(gaussians, { whole, look, eye: seenFrom }) {
     eye.take(data);
     hearing = false;
   });
+
+  function compare() {  // the photograph is shown where the eye is that of its camera
+    const isSeen = toggle.ariaPressed === 'true' && !toggle.hidden && JSON.stringify(eye.pose) === standing;
+    photo.hidden = border.hidden = !isSeen;
+    photo.style.clipPath = `inset(0 0 0 ${border.value}%)`;
+  }
 
   function watch() {  // asks for what is seen once the eye rests; one place at a time
     clearTimeout(resting);
@@ -98,16 +106,23 @@ function begin(gaussians, { whole, look, eye: seenFrom }) {
   const show = i => {
     list.value = (i + facts.cameras.length) % facts.cameras.length;
     eye.pivot = facts.pivot;
-    eye.show(facts.cameras[list.value]);
+    const camera = facts.cameras[list.value];
+    toggle.hidden = !camera.photo;
+    photo.src = camera.photo ?? 'data:,';
+    eye.show(camera);
+    standing = JSON.stringify(eye.pose);
+    compare();
   };
+  border.addEventListener('input', compare);
   list.addEventListener('change', () => show(Number(list.value)));
   const fly = find('fly');
   const commands = {
     '[': () => show(Number(list.value) - 1), ']': () => show(Number(list.value) + 1), r: () => show(Number(list.value)),
     f: () => { eye.orbits = !eye.orbits; fly.setAttribute('aria-pressed', String(!eye.orbits)); },
+    p: () => { toggle.ariaPressed = String(toggle.ariaPressed !== 'true'); if (!toggle.hidden) show(Number(list.value)); },
     h: () => { find('help').hidden = !find('help').hidden; }, '?': () => commands.h(),
   };
-  for (const [id, key] of [['before', '['], ['after', ']'], ['reset', 'r'], ['fly', 'f'], ['more', 'h']]) {
+  for (const [id, key] of [['before', '['], ['after', ']'], ['reset', 'r'], ['fly', 'f'], ['photograph', 'p'], ['more', 'h']]) {
     find(id).addEventListener('click', () => { commands[key](); });
   }
   listen(canvas, eye, commands);
