@@ -26,9 +26,11 @@ import sw_view
 import torch
 from headless_chromium import WEBGL, Chromium, find_chromium
 from PIL import Image
+from sw_anchors.anchors import AnchorSplats
 from sw_gaussians.surfels import as_ellipsoids
-from sw_view.coded_file import covers
+from sw_view.coded_file import OF_ANCHORS, covers
 
+from splatwizard_core.api import SH_C0, Camera
 from splatwizard_core.coding.container import ContainerReader
 from splatwizard_core.coding.cuts import Prefix
 from splatwizard_core.errors import BitstreamError
@@ -69,14 +71,18 @@ class Wasmtime:
         import wasmtime
 
         self.api, self.engine = wasmtime, wasmtime.Engine()
-        self.module = wasmtime.Module.from_file(self.engine, str(FOLDER / "decoder.wasm"))
+        names = ("decoder.wasm", "anchors.wasm")
+        self.modules = {name: wasmtime.Module.from_file(self.engine, str(FOLDER / name)) for name in names}
         self.tables = (FOLDER / "exact_tables.zlib").read_bytes()
 
     def told(self, data: bytes, memory: int = -1, packets: int = 0) -> tuple[str | None, str | None]:
         """Hash or reason; `memory` is the most bytes that the instance may have."""
         store = self.api.Store(self.engine)
         store.set_limits(memory_size=memory)
-        exports = self.api.Instance(store, self.module, []).exports(store)
+        # Also of what is damaged.
+        of_anchors = any(f'"method":"{method}"'.encode() in data[:100] for method in OF_ANCHORS)
+        module = self.modules["anchors.wasm" if of_anchors else "decoder.wasm"]
+        exports = self.api.Instance(store, module, []).exports(store)
         exports["_initialize"](store)
 
         def text(at: int) -> str:
@@ -125,7 +131,8 @@ def tampered() -> list[bytes]:
 
 
 DAMAGED = ("3dgs_r3_v1", "3dgs_exact_v1", "c3dgs_v1", "lightgaussian_ranged_v1", "mesongs_v1", "chimerags_uniform16_v1",
-           "3dgs_packets_v1", "wisp_v1", "wisp_none_v1")  # fmt: skip
+           "3dgs_packets_v1", "wisp_v1", "wisp_none_v1", "hac_exact_v1", "hac_half_v2", "hac_plus_v1",
+           "hac_plus_tiny_v1", "cat_3dgs_refined_v1", "cat_3dgs_refined_v2")  # fmt: skip
 
 
 def damages(data: bytes) -> list[bytes]:
@@ -156,12 +163,26 @@ def test_node_gives_the_hashes_of_the_python_decoder():
 def test_javascript_gets_the_gaussians_of_the_python_decoder(tmp_path):
     in_node(COVERED, tmp_path)
     for path in COVERED:
-        model = as_ellipsoids(decode_model(ContainerReader.open(path), load_plugins()))
+        model = decode_model(ContainerReader.open(path), load_plugins())
+        if isinstance(model, AnchorSplats):
+            compare_with_anchors(np.fromfile(tmp_path / path.name, "<f4"), model)
+            continue
+        model = as_ellipsoids(model)
         sh = torch.cat([model.sh_dc, model.sh_rest], dim=1)
         values = (model.means, model.quats, model.scales, model.opacities, sh)
         wanted = np.concatenate([value.detach().numpy().ravel() for value in values])
         # exp and the sigmoid are those of float64 there, of float32 here; shared opacities pass through a logit.
         np.testing.assert_allclose(np.fromfile(tmp_path / path.name, "<f4"), wanted, rtol=3e-6, atol=1e-6)
+
+
+@torch.no_grad()
+def compare_with_anchors(found: np.ndarray, model: AnchorSplats) -> None:
+    """Arrays of a file of anchors, as they are seen from the origin."""
+    camera = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(3), torch.zeros(3))
+    seen = model.decode(camera, torch.arange(model.num_rows))
+    values = (seen.means, seen.quats, seen.scales, seen.opacities, (seen.colors - 0.5) / SH_C0)
+    wanted = np.concatenate([value.numpy().ravel() for value in values])
+    np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-5)
 
 
 @contextlib.contextmanager

@@ -1,16 +1,23 @@
-"""The WebAssembly decoder that is shipped is the one of the sources that lie beside it."""
+"""The WebAssembly modules that are shipped are those of the sources that lie beside it."""
 
 from __future__ import annotations
 
 import hashlib
 import importlib.util
 import json
+import shutil
+import subprocess
+import time
 import zlib
 from pathlib import Path
 
+import pytest
 import sw_view
 
+from splatwizard_core.coding.container import ContainerReader, ContainerWriter
+
 ROOT = Path(__file__).parents[3]
+GOLDEN = ROOT / "tests" / "golden"
 FOLDER = Path(sw_view.__file__).parent / "splatwizard-decoder"
 BUILT = json.loads((FOLDER / "build.json").read_text())
 AGAIN = "run `pip install ziglang==0.17.1 && python tools/build_decoder.py`"
@@ -25,10 +32,12 @@ def builder():
     return module
 
 
-def test_the_shipped_module_is_built_from_these_sources():
-    assert BUILT["sources"] == builder().sources_hash(), AGAIN
-    module = (FOLDER / "decoder.wasm").read_bytes()
-    assert (BUILT["bytes"], BUILT["sha256"]) == (len(module), hashlib.sha256(module).hexdigest()), AGAIN
+def test_the_shipped_modules_are_built_from_these_sources():
+    assert list(BUILT) == list(builder().MODULES)
+    for name, built in BUILT.items():
+        assert built["sources"] == builder().sources_hash(name), AGAIN
+        module = (FOLDER / name).read_bytes()
+        assert (built["bytes"], built["sha256"]) == (len(module), hashlib.sha256(module).hexdigest()), AGAIN
 
 
 def test_it_has_the_tables_of_sw_codecs():
@@ -36,9 +45,33 @@ def test_it_has_the_tables_of_sw_codecs():
 
 
 def test_it_is_small():
-    assert BUILT["bytes"] <= 150_000
+    assert BUILT["decoder.wasm"]["bytes"] <= 150_000
+    assert BUILT["anchors.wasm"]["bytes"] <= 150_000
     assert sum(path.stat().st_size for path in FOLDER.glob("*.js")) <= 40_000
 
 
 def test_its_package_has_the_version_of_sw_view():
     assert json.loads((FOLDER / "package.json").read_text())["version"] == sw_view.__version__
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="Node is not installed")
+def test_what_is_no_file_and_what_claims_too_much_is_told_in_a_second(tmp_path):
+    """Of each module one file, as it stands on the disk: cut, empty, and with a count that its bytes cannot hold."""
+    paths = []
+    for name, key in (("3dgs_r3_v1", "num_gaussians"), ("hac_half_v2", "num_anchors")):
+        data = (GOLDEN / f"{name}.swz").read_bytes()
+        reader = ContainerReader(data)
+        writer = ContainerWriter(reader.method, reader.version, raster=reader.raster)
+        writer.static.update({**reader.static, key: 1 << 31, "num_gaussians": 1 << 31})
+        for section in reader.sections:
+            writer.add(section, reader.section(section))
+        for number, content in enumerate((data[:100], data[:-1], b"", writer.to_bytes())):
+            paths.append(tmp_path / f"{name}{number}.swz")
+            paths[-1].write_bytes(content)
+    script, start = Path(__file__).with_name("decode_files.mjs"), time.monotonic()
+    done = subprocess.run(["node", script, *paths], capture_output=True, text=True, check=True)
+    told = [json.loads(line)[1] for line in done.stdout.splitlines()]
+    assert time.monotonic() - start < 10
+    assert [reason.split(" ")[0] for reason in told] == ["the", "section", "the", "claims"] * 2
+    assert told[3].startswith("claims a model of 2,147,483,648 Gaussians of ")
+    assert told[7].startswith("claims a model of 2,147,483,648 anchors of ")

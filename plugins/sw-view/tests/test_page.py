@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import html
+import io
 import json
 import re
 import shutil
@@ -16,6 +17,7 @@ from pathlib import Path
 import pytest
 import sw_view
 import torch
+from PIL import Image
 from sw_gaussians.ply import export_ply
 from sw_view import coded_file
 from sw_view.coded_file import with_file
@@ -183,6 +185,32 @@ def test_a_page_holds_the_file_where_that_is_smaller(monkeypatch, name):
     assert with_file(model, packed).facts == {**packed.facts, "reach": packed.reach}
     monkeypatch.setattr(coded_file, "_decoder", lambda **_: " " * 20_000)
     assert with_file(model, packed) is packed
+
+
+def test_a_page_of_anchors_holds_their_file_and_says_how_many(tmp_path, capsys):
+    file, page = GOLDEN / "hac_exact_v2.swz", tmp_path / "x.html"
+    assert main(["view", str(file), "--html", str(page)]) == 0
+    text, facts = page.read_text("utf-8"), facts_of(page)
+    (held,) = re.findall(r'<script type="text/plain" id="gaussians">(.*?)</script>', text)
+    (module,) = re.findall(r'<script type="text/plain" id="wasm">(.*?)</script>', text)
+    assert base64.b64decode(held) == file.read_bytes()
+    assert zlib.decompress(base64.b64decode(module)) == (coded_file.FOLDER / "anchors.wasm").read_bytes()
+    assert (facts["anchors"], facts["count"], facts["degree"]) == (40, 101, 0)
+    assert "<span>101 Gaussians</span><span>of 40 anchors</span>" in text
+
+
+def test_a_page_of_a_scene_holds_some_test_photographs(tmp_path):
+    page, run = tmp_path / "x.html", [str(GOLDEN / "3dgs_one_v1.swz"), "--scene", "demo:tiny", "--html"]
+    for given, most in (([], 4), (["--photos", "1"], 1), (["--photos", "0"], 0)):
+        assert main(["view", *run, str(page), *given]) == 0
+        held = [camera for camera in facts_of(page)["cameras"] if "photo" in camera]
+        tested = [camera for camera in facts_of(page)["cameras"] if camera["name"].endswith("(test)")]
+        assert len(held) == min(most, len(tested))
+        assert all(camera["name"].endswith("(test)") for camera in held)
+        for camera in held:
+            kind, _, text = camera["photo"].partition(",")
+            assert kind == "data:image/jpeg;base64"
+            assert Image.open(io.BytesIO(base64.b64decode(text))).size == (camera["width"], camera["height"])
 
 
 @pytest.mark.parametrize("change", [{"world_origin": [1.0, 0.0, 0.0]}, {"file": "gone.swz"}, {"left_out": {"some": 1}}])

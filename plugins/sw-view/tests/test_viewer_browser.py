@@ -21,9 +21,10 @@ import torch
 from headless_chromium import WEBGL, Chromium, find_chromium
 from PIL import Image
 from sw_gaussians.surfels import gaussians_of
-from sw_view.entries import Opened, find_entries, open_entry
+from sw_view.entries import Opened, about_page, find_entries, for_page, open_entry
 from sw_view.packing import pack
 from sw_view.page_file import About, write_page, write_pair
+from sw_view.photographs import photographs_of
 from sw_view.shown_cameras import surroundings_of
 from sw_view.shown_models import shown_model
 
@@ -78,6 +79,10 @@ def still(browser: Chromium, page: Path, camera: int, size: tuple[int, int]) -> 
     browser.send("Page.navigate", url="about:blank")  # a change of the fragment alone would load nothing
     browser.open(at(f"{page.as_uri()}#camera={camera}&size={size[0]}x{size[1]}&still"), width=1280)
     wait_for(browser, f"document.title === 'still {camera}'")
+    return canvas_of(browser)
+
+
+def canvas_of(browser: Chromium) -> np.ndarray:
     data = browser.ask("document.getElementById('canvas').toDataURL()").partition(",")[2]
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"), np.float64) / 255
 
@@ -165,8 +170,8 @@ def test_a_file_with_cuts_is_shown_coarse_first(browser, tmp_path, monkeypatch, 
     with monkeypatch.context() as patched:
         patched.setattr("sw_view.page_file.pack", lambda _: replace(packed, text="a" * 400_000))
         write_page(model, pages[0], About("toy"), None)
-    slow = pages[0].read_text().replace("tell(0, true);", "setTimeout(() => tell(0, true), 500);")
-    pages[0].write_text(slow)
+    pause = "await new Promise(r => setTimeout(r, 500)); tell(decoded(0),"
+    pages[0].write_text(pages[0].read_text().replace("tell(decoded(0),", pause))
     added = browser.send("Page.addScriptToEvaluateOnNewDocument", source=NOTES_STATES)
     browser.open(at(pages[0].as_uri()), width=800)
     wait_for(browser, "document.documentElement.dataset.state === 'drawn'")
@@ -175,6 +180,25 @@ def test_a_file_with_cuts_is_shown_coarse_first(browser, tmp_path, monkeypatch, 
     assert states[0] == first
     assert states[-1] == "drawn"
     assert psnr(*(still(browser, page, 0, (160, 120)) for page in pages)) > 45
+
+
+@pytest.mark.parametrize("name", ["hac_half_v2", "hac_plus_v1", "cat_3dgs_refined_v2"])
+def test_anchors_are_evaluated_wherever_the_eye_comes_to_rest(browser, tmp_path, name):
+    opened = open_entry(find_entries(GOLDEN / f"{name}.swz")[0], Choices(), load_plugins())
+    page, (packed, note) = tmp_path / "anchors.html", for_page(opened)
+    write_page(packed, page, about_page(opened), opened.around)
+    assert note.startswith("The method's Gaussians depend on the camera")
+
+    def of_rasterizer(camera: Camera) -> np.ndarray:
+        return opened.drawing.render(camera).image.clamp(0, 1).permute(1, 2, 0).numpy()
+
+    cameras = [each.camera.resized(240, 180) for each in opened.around.cameras]
+    assert psnr(*map(of_rasterizer, (cameras[0], cameras[3]))) < 42  # two pictures, not one twice
+    assert psnr(still(browser, page, 0, (240, 180)), of_rasterizer(cameras[0])) > 45
+    browser.ask("(l => { l.value = 3; l.dispatchEvent(new Event('change')); })(document.getElementById('camera'))")
+    wait_for(browser, "document.title === 'still 3'")
+    assert psnr(canvas_of(browser), of_rasterizer(cameras[3])) > 45
+    assert all(url.startswith("blob:") for url in browser.requests()[1:])
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2])
@@ -236,6 +260,39 @@ def test_controls_move_the_eye_and_cameras_bring_it_back(browser, scene, model, 
     assert not [line for line in browser.complaints() if "ReadPixels" not in line]
 
 
+def test_a_photograph_lies_over_the_picture_of_its_camera_alone(browser, scene, model, tmp_path):
+    page, around = tmp_path / "scene.html", surroundings_of(scene)
+    write_page(model, page, About("toy", photographs=photographs_of(around.cameras, 1)), around)
+    browser.send("Page.navigate", url="about:blank")
+    browser.open(page, width=900, height=700)
+    wait_for(browser, "document.documentElement.dataset.state === 'drawn'")
+    seen = "!document.getElementById('photo').hidden && !document.getElementById('border').hidden"
+    assert not browser.ask(seen)
+    browser.key("p", 80)
+    assert browser.ask(seen)
+    slide = "s => { s.value = 0; s.dispatchEvent(new Event('input')); }"
+    browser.ask(f"({slide})(document.getElementById('border'))")
+    wait_for(browser, "document.documentElement.dataset.state === 'drawn'")
+    box = browser.ask("(({x, y, width, height}) => ({x, y, width, height}))"
+                      "(document.getElementById('canvas').getBoundingClientRect())")  # fmt: skip
+    camera = around.cameras[0].camera
+    fit = min(box["width"] / camera.width, box["height"] / camera.height)
+    size = (camera.width * fit, camera.height * fit)
+    clip = {"x": box["x"] + (box["width"] - size[0]) / 2, "y": box["y"] + (box["height"] - size[1]) / 2,
+            "width": size[0], "height": 0.9 * size[1]}  # fmt: skip
+    browser.picture(tmp_path / "photo.png", whole=False, clip=clip)
+    shown = Image.open(tmp_path / "photo.png").convert("RGB").resize((camera.width, round(0.9 * camera.height)))
+    photograph = scene.test[0].image().permute(1, 2, 0).numpy()[: shown.height]
+    assert psnr(np.asarray(shown, np.float64) / 255, photograph) > 25  # scaled twice, and a JPEG
+    browser.key("ArrowRight", 39)
+    assert not browser.ask(seen)
+    browser.key("r", 82)
+    assert browser.ask(seen)
+    browser.key("]", 221)  # which has none
+    assert not browser.ask(seen)
+    assert browser.ask("document.getElementById('photograph').hidden")
+
+
 def test_both_halves_of_a_page_of_two_are_drawn_and_move_together(browser, scene, model, tmp_path):
     """By what the window shows, against the page of each model alone in a window of its half."""
     grey = GaussianModel(model.means, torch.ones_like(model.sh_dc), torch.zeros_like(model.sh_rest),
@@ -246,8 +303,8 @@ def test_both_halves_of_a_page_of_two_are_drawn_and_move_together(browser, scene
         write_page(each, page, about, around)
     write_pair(titled, pages[2], around)
 
-    def shown(page: Path, width: int, camera: int | None = None) -> np.ndarray:
-        browser.open(page, width=width, height=700)
+    def shown(page: Path, width: int, camera: int | None = None, height: int = 700) -> np.ndarray:
+        browser.open(page, width=width, height=height)
         documents = "[document, ...[...document.querySelectorAll('iframe')].map(f => f.contentDocument)]"
         documents = f"{documents}.filter(d => d.getElementById('canvas'))"
         settled = f"{documents}.every(d => d.documentElement.dataset.state === 'drawn')"
@@ -263,12 +320,13 @@ def test_both_halves_of_a_page_of_two_are_drawn_and_move_together(browser, scene
 
     for camera in (None, 1):
         both = shown(pages[2], 1280, camera)
+        height = 700 - browser.ask("document.getElementById('tools').offsetHeight")
         for alone, half in zip(pages, (both[:, :639], both[:, 641:]), strict=False):
             assert half.std() > 0.05
-            assert psnr(half, shown(alone, 639, camera)) > 40
+            assert psnr(half, shown(alone, 639, camera, height)) > 40
     assert psnr(both[:, :639], both[:, 641:]) < 25  # two models, not one twice
 
-    wide = [shown(page, 1280, 1) for page in pages[:2]]
+    wide = [shown(page, 1280, 1, height) for page in pages[:2]]
     shown(pages[2], 1280, 1)
     slide = "s => { s.value = 25; s.dispatchEvent(new Event('input')); }"
     browser.ask(f"document.getElementById('over').click(), ({slide})(document.getElementById('share'))")

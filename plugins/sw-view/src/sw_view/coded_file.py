@@ -1,20 +1,23 @@
 """The encoded file in the page: decoded there by the WebAssembly module of splatwizard-decoder, if it knows the file.
 
-The page then holds the file as it is, and its decoder (about 100 kB of text, with the exact tables of wisp 220), in
-place of Gaussians packed for the GPU.
+The page then holds the file as it is, and its decoder (about 100 kB of text, with exact tables 220), in place of
+Gaussians packed for the GPU. Gaussians of anchors are computed in the page for each place that its eye rests at.
 """
 
 from __future__ import annotations
 
 import base64
 import zlib
+from collections.abc import Sequence
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from splatwizard_core.api import BitstreamError, ContainerReader, GaussianModel, SplatModel
-from sw_view.packing import Packed
+import torch
+
+from splatwizard_core.api import BitstreamError, Camera, ContainerReader, GaussianModel, SplatModel
+from sw_view.packing import Packed, ranges_of
 
 FOLDER = Path(str(files("sw_view"))) / "splatwizard-decoder"
 
@@ -26,7 +29,9 @@ METHODS = (
 CODECS = (
     "gaussians-exact", "gaussians-quantized", "gaussians-zstd", "gaussians-ply", "vectree", "gaussians-indexed", "raht",
 )  # fmt: skip
-WITH_TABLES = ("wisp",)
+OF_ANCHORS = ("hac", "hac-plus", "cat-3dgs")
+"""Methods whose files anchors.wasm knows, in mode `exact`."""
+WITH_TABLES = ("wisp", *OF_ANCHORS)
 """Methods whose files are decoded by the exact tables (module.js)."""
 MODES = ("exact", "quantized")
 """Of `3dgs`, in place of a codec."""
@@ -35,6 +40,8 @@ PARTS = {
     "vq": ("importance-vq",),
 }  # fmt: skip
 """Header value -> what it may name: a file may ask for parts of others, which the decoder lacks."""
+MOST_PLACES = 8
+"""Cameras that the Gaussians of anchors are computed for while a page is written."""
 VECTORS = ("vq", "sh2/vq/header", "sh3/vq/header")
 """Sections whose first byte is 2 if their parts are those of others."""
 
@@ -46,6 +53,8 @@ def covers(reader: ContainerReader) -> bool:
         return False
     if any(reader.section(name)[:1] != b"\1" for name in VECTORS if name in reader):
         return False
+    if reader.method in OF_ANCHORS:
+        return static.get("mode") == "exact"
     if reader.method in ("chimerags", "wisp"):
         return True
     codec, mode = static.get("codec"), static.get("mode")
@@ -64,6 +73,36 @@ def with_file(model: SplatModel, packed: Packed) -> Packed:
     if len(text) + len(decoder) >= len(packed.text):
         return packed
     return Packed(text, {**packed.facts, "reach": packed.reach}, packed.means, packed.reach, decoder)
+
+
+def with_anchors(model: SplatModel, path: Path, cameras: Sequence[Camera]) -> Packed | None:
+    """Return what a page holds of anchors: their file, of which it computes Gaussians wherever the eye rests.
+
+    path        of the file that the model was decoded from
+    cameras     places from which the ranges of its numbers are taken
+
+    None for other models and for files that the decoder does not know. Raises SceneError if no camera sees any.
+    """
+    spawn = getattr(model, "decode", None)
+    if spawn is None or path.suffix != ".swz":
+        return None
+    reader = ContainerReader.open(path)
+    if reader.method not in OF_ANCHORS or not covers(reader):
+        return None
+    positions = getattr(model, model.ROWS[0]).detach()
+    with torch.no_grad():
+        rows = torch.arange(len(positions), device=positions.device)
+        seen = [spawn(camera.to(positions.device), rows) for camera in _some(cameras)]
+    facts, reach = ranges_of(seen)
+    facts |= {"count": int(reader.static["num_gaussians"]), "anchors": len(positions), "reach": reach}
+    text = base64.b64encode(path.read_bytes()).decode("ascii")
+    return Packed(text, facts, positions.float().cpu().numpy(), reach, _decoder("anchors.wasm", has_tables=True))
+
+
+def _some(cameras: Sequence[Camera]) -> list[Camera]:
+    """Return the first cameras of a list and others, evenly spread."""
+    step = -(-len(cameras) // MOST_PLACES)
+    return list(cameras[::step])
 
 
 def _file_of(model: SplatModel) -> tuple[bytes, str] | None:
@@ -93,9 +132,9 @@ def _count(reader: ContainerReader) -> Any:
 
 
 @cache
-def _decoder(*, has_tables: bool = False) -> str:
-    """Return the elements of the page with the decoder: a script for a worker, the module, and tables, deflated."""
-    parts = {"wasm": zlib.compress((FOLDER / "decoder.wasm").read_bytes(), 9)}
+def _decoder(module: str = "decoder.wasm", *, has_tables: bool = False) -> str:
+    """Return the elements of the page with the decoder: a script for a worker, a module, and tables, deflated."""
+    parts = {"wasm": zlib.compress((FOLDER / module).read_bytes(), 9)}
     if has_tables:
         parts["tables"] = (FOLDER / "exact_tables.zlib").read_bytes()
     scripts = [path.read_text("utf-8") for path in (FOLDER / "module.js", FOLDER.parent / "page" / "coded.js")]

@@ -20,12 +20,14 @@ from splatwizard_core.api import (
     UserInputError,
 )
 from splatwizard_core.tooling import Choices, NegotiatedRasterizer, bytes_with_named, open_session, open_subject
+from sw_view.coded_file import with_anchors
 from sw_view.drawing import Drawing
-from sw_view.packing import solid_means
+from sw_view.packing import Packed, solid_means
 from sw_view.page_file import MADE_UP, About
 from sw_view.shown_cameras import Surroundings, made_up_surroundings, surroundings_about, surroundings_of
 
 ENCODED, CONFIG = "scene.swz", "config.toml"
+LIVE = "The method's Gaussians depend on the camera: they are computed anew wherever it comes to rest."
 MOST = 200
 """Runs of one folder that are offered."""
 
@@ -112,12 +114,16 @@ def open_entry(entry: Entry, chosen: Choices, plugins: PluginManager) -> Opened:
     return Opened(entry, drawing, around, has_scene)
 
 
-def fixed_gaussians(opened: Opened) -> tuple[SplatModel, str]:
+def for_page(opened: Opened) -> tuple[SplatModel | Packed, str]:
     """Return a model for a page, and a sentence about its Gaussians and cameras.
 
-    Gaussians that depend on the camera are fitted at the training cameras of the scene, if there is one.
+    Gaussians that depend on the camera are computed in the page, where it has a decoder of the file; else fitted at the
+    training cameras of the scene, if there is one.
     """
     drawing = opened.drawing
+    anchors = with_anchors(drawing.model, opened.entry.file, [each.camera for each in opened.around.cameras])
+    if anchors is not None:
+        return anchors, LIVE if opened.has_scene else f"{LIVE} {MADE_UP}"
     if isinstance(drawing.model, GaussianModel) or not opened.has_scene:
         return drawing.model, "" if opened.has_scene else MADE_UP
     cameras = [view.camera for view in drawing.scene.train]

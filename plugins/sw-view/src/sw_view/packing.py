@@ -15,6 +15,7 @@ from __future__ import annotations
 import base64
 import sys
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,7 +25,7 @@ from numpy.typing import NDArray
 from sw_gaussians.morton import BITS, interleave
 from sw_gaussians.surfels import as_ellipsoids
 
-from splatwizard_core.api import SH_C0, GaussianModel, SceneError, SplatModel
+from splatwizard_core.api import SH_C0, GaussianInputs, GaussianModel, SceneError, SplatModel
 
 CHUNK = 256
 LOG_RANGE = 14.0
@@ -125,6 +126,21 @@ def pack(model: SplatModel) -> Packed:
         "scales": scale_range, "colors": color_range, "bands": steps,
     }  # fmt: skip
     return Packed(base64.b64encode(packed).decode("ascii"), facts, means[order], reach)
+
+
+def ranges_of(seen: Sequence[GaussianInputs]) -> tuple[dict[str, Any], Reach]:
+    """Return what the page needs to quantize Gaussians that it computes itself, from those of some places; and a reach.
+
+    Raises SceneError if there is none.
+    """
+    scales = [each.scales.detach().float().cpu() for each in seen if each.scales is not None and len(each.means)]
+    if not scales:
+        raise SceneError("none of the cameras sees a Gaussian, so there is nothing to show")
+    logs = torch.cat(scales).clamp(min=1e-9).log().numpy()
+    low, high = _scale_range(logs[np.isfinite(logs).all(axis=1)])
+    means = torch.cat([each.means.detach().double().cpu() for each in seen]).numpy()
+    facts = {"degree": 0, "scales": [low, max(high - low, 1e-6) / 1023], "colors": [0.0, 1 / 2047], "bands": []}
+    return facts, _reach(means[np.isfinite(means).all(axis=1)])
 
 
 def morton_order(means: NDArray[np.float32]) -> NDArray[np.int64]:

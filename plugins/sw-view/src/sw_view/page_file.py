@@ -11,8 +11,8 @@ import hashlib
 import html
 import json
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,7 @@ class About:
     eps2d       low-pass, px^2
     antialias   whether opacities are compensated for it
     note        a sentence for the help, about the cameras or the model
+    photographs data: URIs of pictures by the place of their camera
     """
 
     title: str
@@ -56,22 +57,25 @@ class About:
     eps2d: float = 0.3
     antialias: bool = False
     note: str = ""
+    photographs: Mapping[int, str] = field(default_factory=dict)
 
 
-def write_page(model: SplatModel, path: str | os.PathLike[str], about: About, around: Surroundings | None) -> None:
-    """Write the page of explicit Gaussians; the file is complete or absent.
+def write_page(
+    model: SplatModel | Packed, path: str | os.PathLike[str], about: About, around: Surroundings | None
+) -> None:
+    """Write the page of explicit Gaussians, or of what is packed already; the file is complete or absent.
 
     around  cameras to look from; None: made up around the Gaussians
     Raises SceneError for a model whose Gaussians depend on the camera, or that has none.
     """
-    packed = with_file(model, pack(model))
+    packed = _packed(model)
     text = _page(packed, about, around or surroundings_about(packed.means))
     with replacing(path) as temporary:
         Path(temporary).write_text(text, encoding="utf-8")
 
 
 def write_pair(
-    models: Sequence[tuple[SplatModel, About]], path: str | os.PathLike[str], around: Surroundings | None
+    models: Sequence[tuple[SplatModel | Packed, About]], path: str | os.PathLike[str], around: Surroundings | None
 ) -> None:
     """Write one page of several models side by side, looked at from one place; complete or absent.
 
@@ -80,7 +84,7 @@ def write_pair(
     """
     frames = []
     for model, about in models:
-        packed = with_file(model, pack(model))
+        packed = _packed(model)
         around = around or surroundings_about(packed.means)
         page = html.escape(_page(packed, about, around))
         frames.append(f'<iframe title="{html.escape(about.title)}" srcdoc="{page}"></iframe>\n')
@@ -89,6 +93,10 @@ def write_pair(
     text = parts["TITLE"].join(pieces).replace("@FRAMES@", parts["FRAMES"])
     with replacing(path) as temporary:
         Path(temporary).write_text(text, encoding="utf-8")
+
+
+def _packed(model: SplatModel | Packed) -> Packed:
+    return model if isinstance(model, Packed) else with_file(model, pack(model))
 
 
 def export_page(model: SplatModel, path: str | os.PathLike[str]) -> None:
@@ -102,9 +110,13 @@ def _page(packed: Packed, about: About, around: Surroundings) -> str:
         **packed.facts,
         "background": about.background, "eps2d": about.eps2d, "antialias": int(about.antialias),
         "near": around.cameras[0].camera.near, "up": _numbers(around.up), "pivot": _numbers(around.pivot),
-        "size": around.size, "cameras": [_camera(each) for each in around.cameras],
+        "size": around.size, "cameras": [
+            _camera(each) | ({"photo": about.photographs[i]} if i in about.photographs else {})
+            for i, each in enumerate(around.cameras)
+        ],
     }  # fmt: skip
     told = [f"{packed.facts['count']:,} Gaussians"]
+    told += [f"of {packed.facts['anchors']:,} anchors"] if "anchors" in packed.facts else []
     told += [] if about.method is None else [about.method]
     told += [] if about.size is None else [f"{about.size:,} bytes encoded"]
     style, script = _text("style.css"), "".join(_text(name) for name in SCRIPTS)

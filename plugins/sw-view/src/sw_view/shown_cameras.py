@@ -23,10 +23,11 @@ FIELD = math.radians(50)
 
 @dataclass(frozen=True)
 class NamedCamera:
-    """A camera and what a list calls it."""
+    """A camera, what a list calls it, and the test view that it is of, if it is of one."""
 
     name: str
     camera: Camera
+    view: View | None = None
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,12 @@ def cameras_of(scene: Scene, most: int = MOST) -> list[NamedCamera]:
     train = [view for view in scene.train if view.name not in tested]
     kept = [*_evenly(scene.test, most)]
     kept += _evenly(train, most - len(kept))
-    return [NamedCamera(f"{view.name} ({'test' if view.name in tested else 'train'})", view.camera) for view in kept]
+    return [
+        NamedCamera(f"{view.name} (test)", view.camera, view)
+        if view.name in tested
+        else NamedCamera(f"{view.name} (train)", view.camera)
+        for view in kept
+    ]
 
 
 def surroundings_of(scene: Scene) -> Surroundings:

@@ -63,11 +63,13 @@ class PathOrAddress(type(EXISTING)):  # type: ignore[misc]  # the core's type of
     click.option("--html", "page", type=OUTPUT_PAGE, metavar="FILE",
                  help="Write one HTML file that shows the model offline, or two side by side.  [default: none, but a "
                  "server]"),
+    click.option("--photos", type=click.IntRange(0), default=4, show_default=True, metavar="N",
+                 help="With --html: test photographs that the page puts beside its picture."),
     scene_option, images_option, config_option, set_option, device_option, json_option, debug_option,
 )  # fmt: skip
 @takes_choices
 def view(
-    paths: tuple[str | Path, ...], port: int, host: str, page: Path | None, as_json: bool, chosen: Choices
+    paths: tuple[str | Path, ...], port: int, host: str, page: Path | None, photos: int, as_json: bool, chosen: Choices
 ) -> None:  # fmt: skip
     """Look at decoded models in the browser, drawn by this machine; two side by side.
 
@@ -79,15 +81,16 @@ def view(
     if any(isinstance(path, str) for path in paths) and (len(paths) > 1 or page is not None):
         raise click.UsageError("one address is shown alone, and not with --html: download it")
     if page is not None:
-        _write_page([Path(path) for path in paths], page, as_json, chosen)
+        _write_page([Path(path) for path in paths], page, photos, as_json, chosen)
         return
     with tempfile.TemporaryDirectory() as folder:  # of a file that arrives
         _serve(paths, Path(folder), host, port, as_json, chosen)
 
 
-def _write_page(paths: Sequence[Path], page: Path, as_json: bool, chosen: Choices) -> None:
-    from sw_view.entries import about_page, find_all_entries, fixed_gaussians, open_entry
+def _write_page(paths: Sequence[Path], page: Path, photos: int, as_json: bool, chosen: Choices) -> None:
+    from sw_view.entries import about_page, find_all_entries, for_page, open_entry
     from sw_view.page_file import write_page, write_pair
+    from sw_view.photographs import photographs_of
 
     plugins, entries = load_plugins(), find_all_entries(paths)
     if len(entries) > MOST_IN_A_PAGE:
@@ -95,9 +98,11 @@ def _write_page(paths: Sequence[Path], page: Path, as_json: bool, chosen: Choice
             f"--html writes one model or two side by side, here are {len(entries)}: name files or run directories"
         )
     opened = [open_entry(entry, chosen, plugins) for entry in entries.values()]
-    models = [(model, replace(about_page(each), note=note)) for each in opened
-              for model, note in [fixed_gaussians(each)]]  # fmt: skip
-    around = next((each.around for each in opened if each.has_scene), opened[0].around)
+    shown = next((each for each in opened if each.has_scene), opened[0])
+    around = shown.around
+    pictures = photographs_of(around.cameras, photos, shown.drawing.scene.background)
+    models = [(model, replace(about_page(each), note=note, photographs=pictures)) for each in opened
+              for model, note in [for_page(each)]]  # fmt: skip
     if len(models) == 1:
         write_page(models[0][0], page, models[0][1], around)
     else:

@@ -3,6 +3,8 @@
 #pragma once
 #ifdef __SSE2__
 #include <immintrin.h>
+#elif defined(__wasm_simd128__)
+#include <wasm_simd128.h>
 #endif
 
 #include "kernels.h"
@@ -51,7 +53,7 @@ constexpr int WEIGHT_BITS = 15, INPUT_BITS = 10;
 constexpr int32_t SMALL = 32767;  // of 16-bit inputs: two products of -32768 would be 2^31
 constexpr int32_t PART = 1 << INPUT_BITS;  // what parts of inputs up to 2^20 do not exceed
 
-#ifdef __SSE2__
+#if defined(__SSE2__) || defined(__wasm_simd128__)
 constexpr bool HAS_PAIRS = true;
 #ifdef __AVX2__
 constexpr int SUMS = 8;
@@ -68,6 +70,8 @@ static_assert(TILE % (WIDE * SUMS) == 0 && WIDE * SUMS % LANES == 0);
 inline Sum pair_sums(Pair a, Pair b) {
 #ifdef __AVX2__
   return reinterpret_cast<Sum>(_mm256_madd_epi16(reinterpret_cast<__m256i>(a), reinterpret_cast<__m256i>(b)));
+#elif defined(__wasm_simd128__)
+  return reinterpret_cast<Sum>(wasm_i32x4_dot_i16x8(reinterpret_cast<v128_t>(a), reinterpret_cast<v128_t>(b)));
 #else
   return reinterpret_cast<Sum>(_mm_madd_epi16(reinterpret_cast<__m128i>(a), reinterpret_cast<__m128i>(b)));
 #endif

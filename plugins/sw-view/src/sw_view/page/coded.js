@@ -48,15 +48,28 @@ function forGpu(arrays, facts) {
   return { means, words, harmonics: new Uint32Array(harmonics.buffer), texels };
 }
 
-self.onmessage = async ({ data: { wasm, file, tables, facts, coarse } }) => {
+let held = null;  // anchors, and the facts of their page
+
+function tell(arrays, facts, eye, whole) {
+  const found = forGpu(arrays, facts);
+  self.postMessage({ found, eye, whole }, [found.means.buffer, found.words.buffer, found.harmonics.buffer]);
+}
+
+self.onmessage = async ({ data: { wasm, file, tables, facts, coarse, eye } }) => {
   try {
+    if (held) {  // a place that the eye came to
+      tell(held.seen(eye), held.facts, eye, true);
+      return;
+    }
     const module = await WebAssembly.compile(wasm);
-    const tell = (packets, whole) => {
-      const found = forGpu(plain(parameters(module, file, { tables, packets }).arrays), facts);
-      self.postMessage({ found, whole }, [found.means.buffer, found.words.buffer, found.harmonics.buffer]);
-    };
-    if (coarse && cutEnds(file).length > 1) tell(1, false);
-    tell(0, true);
+    if (facts.anchors) {
+      held = { facts, ...anchors(module, file, { tables }) };
+      tell(held.seen(eye), facts, eye, true);
+      return;
+    }
+    const decoded = packets => plain(parameters(module, file, { tables, packets }).arrays);
+    if (coarse && cutEnds(file).length > 1) tell(decoded(1), facts, eye, false);
+    tell(decoded(0), facts, eye, true);
   } catch (error) {
     self.postMessage({ failure: error.message });
   }

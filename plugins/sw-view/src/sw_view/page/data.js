@@ -11,24 +11,26 @@ async function unpacked(text) {
 }
 
 // Tells of what the page holds, the encoded file and its decoder (coded.js) or Gaussians as they are drawn: of the first
-// cut of a file with cuts, if that is asked for, then of all.
-async function eachGaussians({ gaussians, decoder, wasm, tables }, facts, coarse, tell) {
+// cut of a file with cuts, if that is asked for, then of all. Gaussians of anchors are those that are seen from `eye`, and
+// `look` asks for those of another place.
+async function eachGaussians({ gaussians, decoder, wasm, tables }, facts, coarse, eye, tell) {
   const text = gaussians.textContent;
-  if (!decoder) return tell(gaussiansFrom(await unpacked(text), facts), true);
+  if (!decoder) return tell(gaussiansFrom(await unpacked(text), facts), { whole: true });
   const worker = new Worker(URL.createObjectURL(new Blob([decoder.textContent], { type: 'text/javascript' })));
+  const look = facts.anchors ? place => worker.postMessage({ eye: place }) : null;
   const module = await unpacked(wasm.textContent);
   return new Promise((resolve, reject) => {
     worker.onerror = reject;
-    worker.onmessage = ({ data: { found, whole, failure } }) => {
+    worker.onmessage = ({ data: { found, eye: place, whole, failure } }) => {
       try {
         if (failure) throw new Error(failure);
-        tell(found, whole);
+        tell(found, { whole, look, eye: place });
       } catch (error) {
         reject(error);
       }
-      if (whole) resolve();
+      if (whole && !look) resolve();
     };
-    worker.postMessage({ wasm: module, file: bytesFrom(text), tables: tables && bytesFrom(tables.textContent), facts, coarse });
+    worker.postMessage({ wasm: module, file: bytesFrom(text), tables: tables && bytesFrom(tables.textContent), facts, coarse, eye });
   }).finally(() => worker.terminate());
 }
 

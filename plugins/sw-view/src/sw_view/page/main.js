@@ -5,13 +5,18 @@ const facts = JSON.parse(find('facts').textContent);
 const asked = new URLSearchParams(location.hash.slice(1));
 const still = asked.has('still');
 
+const firstCamera = () => Math.min(facts.cameras.length - 1, Math.max(0, Number(asked.get('camera')) || 0));
+
 function fail(error) {
   find('told').textContent = error.message || String(error);
   find('told').hidden = false;
   document.documentElement.dataset.state = 'failed';
 }
 
-function begin(gaussians, whole) {  // returns what takes the whole, where this is the first cut
+const REST = 150;  // milliseconds after which an eye rests
+
+// Returns what takes further Gaussians: the whole, where this is the first cut; what is seen from another place.
+function begin(gaussians, { whole, look, eye: seenFrom }) {
   const canvas = find('canvas');
   const sources = { vertex: find('vertex').textContent.trim(), fragment: find('fragment').textContent.trim() };
   const renderer = new Renderer(canvas, gaussians, facts, sources, still);
@@ -21,7 +26,11 @@ function begin(gaussians, whole) {  // returns what takes the whole, where this 
   let sorting = 0, number = 0, wanted = false, drawing = 0, share = 1, last = 0, rest = 0, ordered = false;
   let hearing = true;  // also until the eye is there
   let next = null;  // Gaussians whose order is not there yet
-  const eye = new Eye(facts, () => { wanted = true; again(); if (!hearing) parent.postMessage(eye.place, '*'); });
+  let looking = null, resting = 0;  // the place that Gaussians are asked for; a timer
+  const photo = find('photo'), border = find('border'), toggle = find('photograph');
+  let standing = '';  // the pose of the camera that was chosen last
+  const eye = new Eye(facts, () => { wanted = true; again(); watch(); compare(); if (!hearing) parent.postMessage(eye.place, '*'); });
+  const isElsewhere = () => Boolean(look) && eye.eye.some((x, k) => x !== seenFrom[k]);
   hearing = parent === window;
   if (!hearing) addEventListener('message', ({ data, source }) => {  // beside another model: both look from one place
     if (source !== parent || !data.axes) return;
@@ -29,6 +38,17 @@ function begin(gaussians, whole) {  // returns what takes the whole, where this 
     eye.take(data);
     hearing = false;
   });
+
+  function compare() {  // the photograph is shown where the eye is that of its camera
+    const isSeen = toggle.ariaPressed === 'true' && !toggle.hidden && JSON.stringify(eye.pose) === standing;
+    photo.hidden = border.hidden = !isSeen;
+    photo.style.clipPath = `inset(0 0 0 ${border.value}%)`;
+  }
+
+  function watch() {  // asks for what is seen once the eye rests; one place at a time
+    clearTimeout(resting);
+    if (look) resting = setTimeout(() => { if (!looking && isElsewhere()) look(looking = [...eye.eye]); }, REST);
+  }
 
   function sort() {  // one order at a time; the newest place is asked for when it is there
     if (sorting || !wanted) return;
@@ -64,7 +84,7 @@ function begin(gaussians, whole) {  // returns what takes the whole, where this 
     const data = document.documentElement.dataset;
     data.firstFrame ||= performance.now().toFixed(1);
     data.frames = Number(data.frames || 0) + 1;
-    data.state = !whole || next ? 'coarse' : sorting || wanted ? 'sorting' : 'drawn';
+    data.state = !whole || next || isElsewhere() ? 'coarse' : sorting || wanted ? 'sorting' : 'drawn';
     if (whole && !next) data.firstWhole ||= performance.now().toFixed(1);
     if (still && data.state === 'drawn') document.title = `still ${find('camera').value}`;
   }
@@ -86,33 +106,44 @@ function begin(gaussians, whole) {  // returns what takes the whole, where this 
   const show = i => {
     list.value = (i + facts.cameras.length) % facts.cameras.length;
     eye.pivot = facts.pivot;
-    eye.show(facts.cameras[list.value]);
+    const camera = facts.cameras[list.value];
+    toggle.hidden = !camera.photo;
+    photo.src = camera.photo ?? 'data:,';
+    eye.show(camera);
+    standing = JSON.stringify(eye.pose);
+    compare();
   };
+  border.addEventListener('input', compare);
   list.addEventListener('change', () => show(Number(list.value)));
   const fly = find('fly');
   const commands = {
     '[': () => show(Number(list.value) - 1), ']': () => show(Number(list.value) + 1), r: () => show(Number(list.value)),
     f: () => { eye.orbits = !eye.orbits; fly.setAttribute('aria-pressed', String(!eye.orbits)); },
+    p: () => { toggle.ariaPressed = String(toggle.ariaPressed !== 'true'); if (!toggle.hidden) show(Number(list.value)); },
     h: () => { find('help').hidden = !find('help').hidden; }, '?': () => commands.h(),
   };
-  for (const [id, key] of [['before', '['], ['after', ']'], ['reset', 'r'], ['fly', 'f'], ['more', 'h']]) {
+  for (const [id, key] of [['before', '['], ['after', ']'], ['reset', 'r'], ['fly', 'f'], ['photograph', 'p'], ['more', 'h']]) {
     find(id).addEventListener('click', () => { commands[key](); });
   }
   listen(canvas, eye, commands);
   canvas.addEventListener('webglcontextlost', () => fail(new Error('The GPU was taken away: load the page again.')));
   new ResizeObserver(again).observe(canvas);
   if (still) document.body.classList.add('still');
-  show(Math.min(facts.cameras.length - 1, Math.max(0, Number(asked.get('camera')) || 0)));
-  return finer => {
+  show(firstCamera());
+  return (finer, { eye: place }) => {
     worker.postMessage({ means: finer.means }, [finer.means.buffer]);
     next = { gaussians: finer, after: number };
     whole = wanted = true;
+    looking = null, seenFrom = place;
     again();
+    watch();
   };
 }
 
 let refine = null;
-eachGaussians(Object.fromEntries(['gaussians', 'decoder', 'wasm', 'tables'].map(id => [id, find(id)])), facts, !still, (found, whole) => {
-  if (refine) refine(found); else refine = begin(found, whole);
-  if (whole) for (const id of ['gaussians', 'decoder', 'wasm', 'tables']) find(id)?.remove();
+const first = new Eye(facts, () => {}), parts = Object.fromEntries(['gaussians', 'decoder', 'wasm', 'tables'].map(id => [id, find(id)]));
+first.show(facts.cameras[firstCamera()]);
+eachGaussians(parts, facts, !still, first.eye, (found, of) => {
+  if (refine) refine(found, of); else refine = begin(found, of);
+  if (of.whole) for (const id of ['gaussians', 'decoder', 'wasm', 'tables']) find(id)?.remove();
 }).catch(fail);

@@ -1,4 +1,5 @@
-// The worker: orders Gaussians by their depth, the farthest first. It gets their means once, then directions.
+// The worker: orders Gaussians by their depth, the farthest first, and of equal ones the last first, as the rasterizers do:
+// those of an anchor may share a place. It gets their means once, then directions.
 let means = null;
 
 function order(forward, offset, nearest) {
@@ -7,7 +8,7 @@ function order(forward, offset, nearest) {
   const depth = new Float32Array(1), bits = new Uint32Array(depth.buffer);
   const low = new Uint32Array(65537), high = new Uint32Array(65537);
   let count = 0;
-  for (let i = 0; i < n; i++) {
+  for (let i = n - 1; i >= 0; i--) {
     depth[0] = forward[0] * means[3 * i] + forward[1] * means[3 * i + 1] + forward[2] * means[3 * i + 2] + offset;
     if (!(depth[0] > nearest)) continue;
     const key = ~bits[0] >>> 0;  // bits of positive floats are in the order of their values

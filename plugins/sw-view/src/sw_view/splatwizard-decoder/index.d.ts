@@ -41,6 +41,8 @@ export interface Options {
   packets?: number;
   /** Called with coarser Gaussians of a file with cuts, before it is whole: while a Response arrives, else for its first cut. */
   onCut?: (coarse: Gaussians) => void;
+  /** Of a file of anchors, the place [x, y, z] that its Gaussians are seen from; the default is the origin. */
+  eye?: [number, number, number];
   /** Whether to compute the hash of the decoded parameters. */
   hash?: boolean;
   /** Whether to decode in a thread of its own; the default where the platform has `Worker`. */
@@ -55,6 +57,23 @@ export class DecodeError extends Error {
 
 /** Decodes a file. Rejects with DecodeError for one that is damaged, or that needs more than this decoder knows. */
 export function decode(source: Uint8Array | ArrayBuffer | Response | Blob, options?: Options): Promise<Gaussians>;
+
+/** Anchors of a file of `hac`, `hac-plus` or `cat-3dgs`: they spawn other Gaussians for each place to look from. */
+export interface Anchors {
+  /** The header of the file. */
+  meta: Header;
+  /** SHA-256 of the decoded parameters, if it was asked for. */
+  hash: string | null;
+  /** The Gaussians that are seen from a place [x, y, z], world units. */
+  from(eye: [number, number, number]): Promise<Gaussians>;
+  /** Ends the worker, and with it what it holds. */
+  close(): void;
+}
+
+/** Decodes a file of anchors, and stays to be asked what is seen from where. Rejects as `decode` does. */
+export function anchors(
+  source: Uint8Array | ArrayBuffer | Response | Blob, options?: Pick<Options, 'signal' | 'hash' | 'worker'>,
+): Promise<Anchors>;
 
 /** The header of a file, unchecked but for its form. */
 export function info(bytes: Uint8Array): Header;

@@ -1,9 +1,13 @@
 // splatwizard-decoder: .swz files in browsers and Node. See index.d.ts for the types.
-import { cutEnds, DecodeError, gaussians, info, needsTables, parameters } from './module.js';
+import { anchors as anchorsOf, cutEnds, DecodeError, decodedGaussians, gaussians, info, moduleOf, needsTables } from './module.js';
 
 export { DecodeError, info };
 
-let loading = null, loadingTables = null;
+const loading = {};
+
+const loaded = name => loading[name] ??= load(new URL(name, import.meta.url));
+const compiled = name => loading[`compiled ${name}`] ??= loaded(name).then(WebAssembly.compile);
+const ownTables = async bytes => (needsTables(bytes) ? loaded('./exact_tables.zlib') : null);
 
 async function load(place) {
   if (place.protocol === 'file:' && globalThis.process?.versions?.node) {
@@ -37,27 +41,50 @@ async function bytesOf(source, seen) {
   }
 }
 
-function inWorker(module, bytes, options, signal) {
+// A worker, and what it answers to a message.
+function startWorker(signal) {
   const worker = new Worker(new URL('./worker.js', import.meta.url), { type: 'module' });
-  return new Promise((resolve, reject) => {
+  const ask = message => new Promise((resolve, reject) => {
     signal?.addEventListener('abort', () => reject(signal.reason), { once: true });
     worker.onerror = event => reject(new Error(event.message || 'the worker of the decoder could not be started'));
     worker.onmessage = ({ data: { found, reason, failure } }) => {
       if (found) resolve(found);
       else reject(reason === null ? new Error(failure) : new DecodeError(reason));
     };
-    worker.postMessage({ module, bytes, options });
-  }).finally(() => worker.terminate());
+    worker.postMessage(message);
+  });
+  return { ask, end: () => worker.terminate() };
 }
 
-export async function decode(source, { signal, onCut, hash = false, packets = 0, worker = typeof Worker !== 'undefined' } = {}) {
+const hasWorkers = typeof Worker !== 'undefined';
+
+export async function anchors(source, { signal, hash = false, worker = hasWorkers } = {}) {
   signal?.throwIfAborted();
-  const module = await (loading ??= load(new URL('./decoder.wasm', import.meta.url)).then(WebAssembly.compile));
+  const bytes = await bytesOf(source), module = await compiled('./anchors.wasm'), options = { hash, tables: await ownTables(bytes) };
+  const meta = info(bytes);
+  if (!worker) {
+    const held = anchorsOf(module, bytes, options);
+    return { meta, hash: held.hash, from: async eye => gaussians(bytes, { arrays: held.seen(eye), hash: held.hash }), close() {} };
+  }
+  const { ask, end } = startWorker(signal);
+  let last = ask({ module, bytes, options, stays: true });  // one after another
+  try {
+    const found = await last;
+    return { meta, hash: found.hash, from: eye => (last = last.then(() => ask({ eye }), () => ask({ eye }))), close: end };
+  } catch (error) {
+    end();
+    throw error;
+  }
+}
+
+export async function decode(source, { signal, onCut, hash = false, packets = 0, eye = [0, 0, 0], worker = hasWorkers } = {}) {
+  signal?.throwIfAborted();
   const decoded = async (bytes, own) => {
     signal?.throwIfAborted();
-    const tables = needsTables(bytes) ? await (loadingTables ??= load(new URL('./exact_tables.zlib', import.meta.url))) : null;
-    const options = { ...own, tables };
-    return worker ? inWorker(module, bytes, options, signal) : gaussians(bytes, parameters(module, bytes, options));
+    const module = await compiled(`./${moduleOf(bytes)}`), options = { ...own, eye, tables: await ownTables(bytes) };
+    if (!worker) return decodedGaussians(module, bytes, options);
+    const { ask, end } = startWorker(signal);
+    return ask({ module, bytes, options }).finally(end);
   };
   let shown = 0, coarse = null;
   const seen = bytes => {  // a file that ends at a cut is a whole, coarser one

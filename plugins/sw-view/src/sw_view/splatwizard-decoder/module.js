@@ -32,16 +32,28 @@ export function cutEnds(bytes) {
   return (info(bytes).cuts ?? []).map(([, end]) => 14 + view.getUint32(6, true) + end);
 }
 
-const WITH_TABLES = ['wisp'];
+const OF_ANCHORS = ['hac', 'hac-plus', 'cat-3dgs'], WITH_TABLES = ['wisp', ...OF_ANCHORS];
+
+// Null for what is no file: the decoder then says why.
+function methodOf(bytes) {
+  try {
+    return info(bytes).method;
+  } catch {
+    return null;
+  }
+}
+
+/** Whether a file holds anchors, whose Gaussians depend on where they are seen from. */
+export function hasAnchors(bytes) { return OF_ANCHORS.includes(methodOf(bytes)); }
+
+/** Name of the WebAssembly module that knows a file. */
+export function moduleOf(bytes) { return hasAnchors(bytes) ? 'anchors.wasm' : 'decoder.wasm'; }
 
 /** Whether a file is decoded by the exact tables, exact_tables.zlib. */
-export function needsTables(bytes) { return WITH_TABLES.includes(info(bytes).method); }
+export function needsTables(bytes) { return WITH_TABLES.includes(methodOf(bytes)); }
 
-/**
- * The parameters in a file by name, each { shape, data: Float32Array }; with `hash` the SHA-256 of them, which
- * `sw decode --hash` prints; of a file with cuts `packets` may be how many to read. `tables` are the bytes of exact_tables.zlib, for files that need them. An instance of the module lives for this call only, and with it all memory but the result.
- */
-export function parameters(module, bytes, { hash = false, packets = 0, tables = null } = {}) {
+// An instance of a module that has decoded a file, and what reads its memory.
+function decodedBy(module, bytes, packets, tables) {
   const { exports } = new WebAssembly.Instance(module, {});
   exports._initialize();
   const text = at => {
@@ -49,14 +61,30 @@ export function parameters(module, bytes, { hash = false, packets = 0, tables = 
     return new TextDecoder().decode(memory.subarray(0, memory.indexOf(0)));
   };
   const put = (content, at) => new Uint8Array(exports.memory.buffer, at, content.length).set(content);
-  try {
+  const guarded = call => {
+    try {
+      return call();
+    } catch (error) {
+      if (!(error instanceof WebAssembly.RuntimeError)) throw error;
+      throw new DecodeError(text(exports.swz_refusal()) || `the decoder failed: ${error.message}`);
+    }
+  };
+  guarded(() => {
     put(bytes, exports.swz_input(bytes.length));
     if (tables) put(tables, exports.swz_tables(tables.length));
     exports.swz_decode(packets);
-  } catch (error) {
-    if (!(error instanceof WebAssembly.RuntimeError)) throw error;
-    throw new DecodeError(text(exports.swz_refusal()) || `the decoder failed: ${error.message}`);
-  }
+  });
+  return { exports, text, guarded };
+}
+
+/**
+ * The parameters in a file by name, each { shape, data: Float32Array }; with `hash` the SHA-256 of them, which
+ * `sw decode --hash` prints; of a file with cuts `packets` may be how many to read. `tables` are the bytes of
+ * exact_tables.zlib, for files that need them. An instance of the module lives for this call only, and with it all memory
+ * but the result.
+ */
+export function parameters(module, bytes, { hash = false, packets = 0, tables = null } = {}) {
+  const { exports, text } = decodedBy(module, bytes, packets, tables);
   const FIELDS = 8, arrays = {};  // pointers to name and values, whether it is an index, number of axes, four lengths
   const fields = new Uint32Array(exports.memory.buffer, exports.swz_arrays(), FIELDS * exports.swz_count());
   for (let i = 0; i < fields.length; i += FIELDS) {
@@ -67,6 +95,36 @@ export function parameters(module, bytes, { hash = false, packets = 0, tables = 
   return { arrays, hash: hash ? text(exports.swz_hash()) : null };
 }
 
+/**
+ * The anchors in a file: `seen(eye)` gives the raw parameters of the Gaussians that they spawn for a place [x, y, z], as
+ * `parameters` has those of others. An instance of anchors.wasm lives as long as this.
+ */
+export function anchors(module, bytes, { hash = false, tables = null } = {}) {
+  const { exports, text, guarded } = decodedBy(module, bytes, 0, tables);
+  const seen = eye => {
+    const count = guarded(() => exports.swz_see(...eye));
+    const pointers = new Uint32Array(exports.memory.buffer, exports.swz_seen(), 5);
+    const [means, opacities, scales, quats, colors] = [3, 1, 3, 4, 3].map((width, i) => (
+      new Float32Array(exports.memory.buffer, pointers[i], width * count).slice()));
+    return {
+      means: { shape: [count, 3], data: means }, quats: { shape: [count, 4], data: quats },
+      log_scales: { shape: [count, 3], data: scales.map(scale => Math.log(Math.max(SMALLEST_SCALE, scale))) },
+      opacity_logits: { shape: [count], data: opacities.map(logit) },
+      sh_dc: { shape: [count, 1, 3], data: colors.map(color => (color - 0.5) / SH_BAND_0) },
+      sh_rest: { shape: [count, 0, 3], data: new Float32Array(0) },
+    };
+  };
+  return { seen, hash: hash ? text(exports.swz_hash()) : null };
+}
+
+const SH_BAND_0 = 0.28209479177387814;
+const LOGIT_MARGIN = 1e-6, SMALLEST_SCALE = 1e-9;  // as the Python package makes plain Gaussians of shared ones
+
+function logit(opacity) {
+  const x = Math.min(1 - LOGIT_MARGIN, Math.max(LOGIT_MARGIN, opacity));
+  return Math.log(x / (1 - x));
+}
+
 // A row of `of` for each Gaussian, by its index.
 function gathered({ shape: [, ...rest], data }, { data: index }) {
   const width = rest.reduce((a, b) => a * b, 1), found = new Float32Array(width * index.length);
@@ -74,29 +132,31 @@ function gathered({ shape: [, ...rest], data }, { data: index }) {
   return { shape: [index.length, ...rest], data: found };
 }
 
-const LOGIT_MARGIN = 1e-6, SMALLEST_SCALE = 1e-9;  // as the Python package makes plain Gaussians of shared ones
-
 /** Raw parameters of plain Gaussians, of whatever `parameters` gave: codebooks are gathered. */
 export function plain(arrays) {
   if (arrays.sh_dc) return arrays;
   const { means, color_dc, color_rest, color_index, log_factors, opacity_values, shape_scales, shape_quats, shape_index } = arrays;
-  const logit = x => Math.log(x / (1 - x)), log_scales = gathered(shape_scales, shape_index);
+  const log_scales = gathered(shape_scales, shape_index);
   log_scales.data.forEach((scale, k) => {
     log_scales.data[k] = Math.log(Math.max(SMALLEST_SCALE, Math.exp(log_factors.data[Math.floor(k / 3)]) * scale));
   });
   return {
     means, log_scales, quats: gathered(shape_quats, shape_index),
-    opacity_logits: {
-      shape: opacity_values.shape,
-      data: opacity_values.data.map(x => logit(Math.min(1 - LOGIT_MARGIN, Math.max(LOGIT_MARGIN, x)))),
-    },
+    opacity_logits: { shape: opacity_values.shape, data: opacity_values.data.map(logit) },
     sh_dc: gathered(color_dc, color_index), sh_rest: gathered(color_rest, color_index),
   };
 }
 
 const SURFEL_THICKNESS = 1e-8;  // world units, as `sw export` gives surfels a third axis
 
-/** Gaussians as a renderer wants them, of what `parameters` gave. */
+/** Gaussians of a file as a renderer wants them; of anchors those that are seen from `eye`. */
+export function decodedGaussians(module, bytes, options) {
+  if (!hasAnchors(bytes)) return gaussians(bytes, parameters(module, bytes, options));
+  const { seen, hash } = anchors(module, bytes, options);
+  return gaussians(bytes, { arrays: seen(options.eye), hash });
+}
+
+/** Gaussians as a renderer wants them, of what `parameters` or `seen` gave. */
 export function gaussians(bytes, { arrays, hash }) {
   const { means, log_scales, quats, opacity_logits, sh_dc, sh_rest } = plain(arrays);
   const count = means.shape[0], rest = 3 * sh_rest.shape[1], axes = log_scales.shape[1];

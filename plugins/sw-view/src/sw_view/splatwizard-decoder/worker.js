@@ -1,9 +1,16 @@
-// Decodes one file in a thread of its own.
-import { gaussians, parameters } from './module.js';
+// Decodes one file in a thread of its own; of anchors, tells what is seen from each place that it is then sent.
+import { anchors, decodedGaussians, gaussians } from './module.js';
 
-self.onmessage = ({ data: { module, bytes, options } }) => {
+let held = null;
+
+self.onmessage = ({ data: { module, bytes, options, stays, eye } }) => {
   try {
-    const found = gaussians(bytes, parameters(module, bytes, options));
+    if (stays) {
+      held = { bytes, ...anchors(module, bytes, options) };
+      self.postMessage({ found: { hash: held.hash } });
+      return;
+    }
+    const found = eye ? gaussians(held.bytes, { arrays: held.seen(eye), hash: held.hash }) : decodedGaussians(module, bytes, options);
     const { means, quats, scales, opacities, sh } = found;
     self.postMessage({ found }, [means, quats, scales, opacities, sh].map(array => array.buffer));
   } catch (error) {

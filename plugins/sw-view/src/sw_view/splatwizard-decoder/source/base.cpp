@@ -61,6 +61,9 @@ void make_crc_tables() {
 }  // namespace
 
 uint32_t crc32(const void* bytes, int64_t count, uint32_t before) {
+#ifdef SWZ_BLIND  // for fuzzing: no checksum stands in the way
+  return 0;
+#endif
   if (crc_tables[0][1] == 0) make_crc_tables();
   const auto& t = crc_tables;
   const auto* data = static_cast<const uint8_t*>(bytes);

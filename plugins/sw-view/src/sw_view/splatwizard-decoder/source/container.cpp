@@ -4,7 +4,7 @@ namespace swz {
 
 namespace {
 
-constexpr int64_t PREFIX = 10, MAX_HEADER = 1 << 19, MAX_SECTIONS = 4096, FREE = 1 << 24, EXPANSION = 256;
+constexpr int64_t PREFIX = 10, MAX_HEADER = 1 << 19, MAX_SECTIONS = 4096;
 
 bool is_letter_or_digit(char c) {
   return (c >= '0' && c <= '9') || (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z');
@@ -228,13 +228,6 @@ void Container::usual(const char* part, const char* name) const {
   const Json* found = value(part);
   if (found != nullptr && !found->is(name))
     refuse("the file asks for ", part, " '", found->text, "', which this decoder lacks");
-}
-
-void Container::allow(int64_t decoded, int64_t gaussians) const {
-  const int64_t most = FREE + EXPANSION * payload;
-  if (decoded > most)
-    refuse("claims a model of ", grouped(gaussians), " Gaussians of ", grouped(decoded), " bytes in memory, a file of ",
-           grouped(payload), " may stand for at most ", grouped(most));
 }
 
 void Container::finish() const {

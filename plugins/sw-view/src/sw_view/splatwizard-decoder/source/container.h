@@ -6,6 +6,8 @@ namespace swz {
 
 enum Dtype : uint8_t { INT32 = 6, FLOAT32 = 10, FLOAT64 = 11 };  // their codes in a file
 
+constexpr int64_t FREE = 1 << 24, EXPANSION = 256;  // bytes of a model: always, and for each byte of its sections
+
 struct Section {
   const char* name;
   Bytes content;
@@ -29,7 +31,17 @@ struct Container {
   bool has(const char* name) const;
   int64_t integer(const char* key, int64_t low, int64_t high) const;
   void usual(const char* part, const char* name) const;  // refuses a file that names anything else for a part
-  void allow(int64_t decoded, int64_t gaussians) const;  // refuses what so small a file must not stand for
+  // Refuses what so small a file must not stand for, which `parts` name.
+  template <class... Parts>
+  void allow_what(int64_t decoded, Parts... parts) const {
+    const int64_t most = FREE + EXPANSION * payload;
+    if (decoded > most)
+      refuse("claims ", parts..., " of ", grouped(decoded), " bytes in memory, a file of ", grouped(payload),
+             " may stand for at most ", grouped(most));
+  }
+  void allow(int64_t decoded, int64_t gaussians) const {
+    allow_what(decoded, "a model of ", grouped(gaussians), " Gaussians");
+  }
   void finish() const;                                   // refuses sections that nobody asked for
 
  private:

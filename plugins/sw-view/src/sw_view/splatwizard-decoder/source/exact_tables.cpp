@@ -46,7 +46,30 @@ void ExactTables::check(int64_t stated_version, int64_t stated_crc) const {
          mine.data, "): install the sw-codecs version that wrote the file");
 }
 
-ExactTables exact_tables() {
+void TableFamily::read(Bytes& from) {
+  radius = Buffer<int32_t>(TABLES);
+  int64_t entries = 0;
+  for (int i = 0; i < LEVELS; ++i) {
+    const auto own = static_cast<int32_t>(from.integer(2));
+    for (int f = 0; f < FRACTIONS; ++f) radius[FRACTIONS * i + f] = own;
+    entries += FRACTIONS * (2 * own + 2);
+  }
+  counts = Buffer<uint16_t>(entries);
+  std::memcpy(counts.data, from.take(2 * entries).data, static_cast<size_t>(2 * entries));
+  shares = Buffer<int32_t>(entries + TABLES);
+  first = Buffer<int32_t>(TABLES);
+  first_count = Buffer<int64_t>(TABLES);
+  bucket = Buffer<uint16_t>(256 * TABLES);
+  for (int64_t i = 0, at = 0; i < TABLES; ++i) {
+    const int64_t size = 2 * radius[i] + 2;
+    first[i] = static_cast<int32_t>(at + i);
+    first_count[i] = at;
+    put_table(counts.data + at, size, shares.data + first[i], bucket.data + 256 * i);
+    at += size;
+  }
+}
+
+ExactTables exact_tables(bool has_laplace) {
   const Blame blame(nullptr);
   if (packed_tables.size == 0) refuse("the decoder was not given its tables");
   Buffer<uint8_t> file(TABLE_FILE);
@@ -63,27 +86,9 @@ ExactTables exact_tables() {
   if (found.version != VERSION) refuse("the exact tables of the decoder are damaged");
   for (auto& each : found.multipliers) each = static_cast<uint16_t>(from.integer(2));
   for (auto& each : found.scales) each = static_cast<double>(from.integer(4)) / (1 << 20);
-  from.take(4 * (LEVELS - 1));  // thresholds
-  found.radius = Buffer<int32_t>(TABLES);
-  int64_t entries = 0;
-  for (int i = 0; i < LEVELS; ++i) {
-    const auto radius = static_cast<int32_t>(from.integer(2));
-    for (int f = 0; f < FRACTIONS; ++f) found.radius[FRACTIONS * i + f] = radius;
-    entries += FRACTIONS * (2 * radius + 2);
-  }
-  found.counts = Buffer<uint16_t>(entries);
-  std::memcpy(found.counts.data, from.take(2 * entries).data, static_cast<size_t>(2 * entries));
-  found.shares = Buffer<int32_t>(entries + TABLES);
-  found.first = Buffer<int32_t>(TABLES);
-  found.first_count = Buffer<int64_t>(TABLES);
-  found.bucket = Buffer<uint16_t>(256 * TABLES);
-  for (int64_t i = 0, at = 0; i < TABLES; ++i) {
-    const int64_t size = 2 * found.radius[i] + 2;
-    found.first[i] = static_cast<int32_t>(at + i);
-    found.first_count[i] = at;
-    put_table(found.counts.data + at, size, found.shares.data + found.first[i], found.bucket.data + 256 * i);
-    at += size;
-  }
+  for (auto& each : found.thresholds) each = static_cast<int64_t>(from.integer(4));
+  found.gaussian.read(from);
+  if (has_laplace) found.laplace.read(from);
   return found;
 }
 

@@ -10,15 +10,23 @@ namespace swz {
 constexpr int64_t TABLE_FILE = 316202;  // bytes
 constexpr int CENTRED = 4;              // fraction of tables whose mean is a whole number of steps
 
+// The 512 tables of a density.
+struct TableFamily {
+  Buffer<int32_t> shares, first, radius;  // as kernels take them
+  Buffer<uint16_t> bucket, counts;        // counts less 1, tables back to back without an end
+  Buffer<int64_t> first_count;            // [512] where those of a table begin
+
+  void read(Bytes& from);
+  splatwizard::Tables tables() const { return {shares.data, first.data, radius.data, bucket.data}; }
+};
+
 struct ExactTables {
   uint32_t version, crc;
   uint16_t multipliers[128];
   double scales[64];
-  Buffer<int32_t> shares, first, radius;  // of the Gaussian's tables, as kernels take them
-  Buffer<uint16_t> bucket, counts;        // counts less 1, tables back to back without an end
-  Buffer<int64_t> first_count;            // [512] where those of a table begin
+  int64_t thresholds[63];
+  TableFamily gaussian, laplace;  // the second only where it was asked for
 
-  splatwizard::Tables tables() const { return {shares.data, first.data, radius.data, bucket.data}; }
   // Refuses a file that was coded with others.
   void check(int64_t stated_version, int64_t stated_crc) const;
   int64_t multiplier(int64_t output) const {
@@ -29,6 +37,6 @@ struct ExactTables {
 
 extern Buffer<uint8_t> packed_tables;  // the zlib stream; empty: the host has none
 
-ExactTables exact_tables();
+ExactTables exact_tables(bool has_laplace = false);
 
 }  // namespace swz

@@ -8,12 +8,12 @@ namespace swz {
 
 namespace {
 
-constexpr int64_t MAX_POINTS = 1 << 26, ALWAYS_ALLOWED = 1 << 16, POINTS_PER_BYTE = 64, CONTEXTS = 4, OCCUPANCIES = 255;
+constexpr int64_t ALWAYS_ALLOWED = 1 << 16, POINTS_PER_BYTE = 64, CONTEXTS = 4, OCCUPANCIES = 255;
 constexpr int OWN = 1, LATEST = 2;  // else equal counts
 
-int64_t point_limit(int64_t bytes) {
-  const int64_t most = POINTS_PER_BYTE * bytes > ALWAYS_ALLOWED ? POINTS_PER_BYTE * bytes : ALWAYS_ALLOWED;
-  return most < MAX_POINTS ? most : MAX_POINTS;
+int64_t point_limit(int64_t bytes, int64_t most) {
+  const int64_t allowed = POINTS_PER_BYTE * bytes > ALWAYS_ALLOWED ? POINTS_PER_BYTE * bytes : ALWAYS_ALLOWED;
+  return allowed < most ? allowed : most;
 }
 
 // Tables of counts [depth, 4, 255] of all levels and contexts.
@@ -115,12 +115,12 @@ Buffer<int32_t> times_of(Bytes& from, int64_t count, int64_t distinct) {
 
 }  // namespace
 
-Points octree(Bytes data) {
+Points octree(Bytes data, int64_t most) {
   const int64_t bytes = data.left;
   const auto version = static_cast<int64_t>(data.integer(1)), bits = static_cast<int64_t>(data.integer(1));
   if (version != 1) refuse("octree of version ", version, " is not known: upgrade sw-codecs");
   if (bits < 1 || bits > 21) refuse(bits, " bits an axis, must be 1..21");
-  const auto count = static_cast<int64_t>(data.varint(static_cast<uint64_t>(point_limit(bytes))));
+  const auto count = static_cast<int64_t>(data.varint(static_cast<uint64_t>(point_limit(bytes, most))));
   const auto distinct = static_cast<int64_t>(data.varint(static_cast<uint64_t>(count)));
   if ((count == 0) != (distinct == 0)) refuse(grouped(count), " points, but ", grouped(distinct), " distinct ones");
   Points points{Buffer<int64_t>(count), bits};

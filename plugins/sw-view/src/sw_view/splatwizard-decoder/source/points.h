@@ -20,6 +20,9 @@ struct Points {
   }
 };
 
-Points octree(Bytes data);
+constexpr int64_t MAX_POINTS = 1 << 26;
+
+// Refuses more points than `most`, and than so few bytes may stand for.
+Points octree(Bytes data, int64_t most = MAX_POINTS);
 
 }  // namespace swz

@@ -7,6 +7,9 @@
 namespace swz {
 
 constexpr int MAX_TABLE = 4096;
+constexpr char DAMAGED_WORDS[] =
+    "entropy decoding failed: AssertionError: Tried to decode from compressed data that is invalid for the employed entropy "
+    "model.";
 constexpr char CRC_DIFFERS[] = "the decoded symbols do not match their CRC-32: damaged data or a wrong model";
 
 // A table of counts as a model.
@@ -20,8 +23,7 @@ struct Model {
   int32_t symbol(arch_native::RangeReader& words) const {
     const uint64_t q = words.quantile();
     if (q >= arch_native::TOP)
-      refuse("entropy decoding failed: AssertionError: Tried to decode from compressed data that is invalid for the "
-             "employed entropy model.");
+      refuse(DAMAGED_WORDS);
     int32_t found = bucket[q >> (arch_native::BITS - 10)];
     while (share[found + 1] <= q) ++found;
     words.take(share[found], share[found + 1]);

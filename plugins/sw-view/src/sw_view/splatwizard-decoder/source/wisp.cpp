@@ -70,10 +70,10 @@ struct Stream {
   void indices(const int16_t* number, int64_t count, int32_t* found) {
     if (count == 0) return;
     begin();
-    if (arch_native::range_entries(session(), tables.tables(), number, count, found)) refuse(DAMAGED);
+    if (arch_native::range_entries(session(), tables.gaussian.tables(), number, count, found)) refuse(DAMAGED);
     int64_t escaped = 0;
     for (int64_t i = 0; i < count; ++i) {
-      const int32_t radius = tables.radius[number[i]];
+      const int32_t radius = tables.gaussian.radius[number[i]];
       escaped += found[i] > 2 * radius;
       found[i] -= radius;
     }
@@ -84,7 +84,7 @@ struct Stream {
     Buffer<int64_t> row(escaped), value(escaped), active(escaped);
     Buffer<uint8_t> negative(escaped), length(escaped);
     for (int64_t i = 0, at = 0; i < count; ++i)
-      if (found[i] > tables.radius[number[i]]) row[at++] = i;
+      if (found[i] > tables.gaussian.radius[number[i]]) row[at++] = i;
     EvenBits bits(*this);
     for (int64_t i = 0; i < escaped; ++i) negative[i] = bits.next(), value[i] = length[i] = 1, active[i] = i;
     int most = 1;
@@ -101,7 +101,7 @@ struct Stream {
       for (int64_t i = 0; i < escaped; ++i)
         if (length[i] > place) value[i] = value[i] << 1 | bits.next();
     for (int64_t i = 0; i < escaped; ++i) {
-      const int64_t size = value[i] + tables.radius[number[row[i]]];
+      const int64_t size = value[i] + tables.gaussian.radius[number[row[i]]];
       if (size >= INDEX_LIMIT) refuse("an index is beyond ", grouped(INDEX_LIMIT), " steps");
       found[row[i]] = static_cast<int32_t>(negative[i] ? -size : size);
     }
@@ -231,11 +231,11 @@ struct Walk {
       const int64_t row = part[i / width], column = REFINED.first + i % width, at = NUMBERS * row + column;
       before[i] = splats.unit(row, column);
       coarse[i] = splats.index[at] / POWERS_OF_3[p + 1];  // whole
-      const int64_t table = 8 * table_of(splats.scale[at], p) + CENTRED, radius = tables.radius[table];
+      const int64_t table = 8 * table_of(splats.scale[at], p) + CENTRED, radius = tables.gaussian.radius[table];
       for (int64_t k = 0; k < 3; ++k) {
         const int64_t fine = 3 * coarse[i] + k - 1;
         const bool inside = fine >= -radius && fine <= radius;
-        counts[3 * i + k] = inside ? tables.counts[tables.first_count[table] + fine + radius] + 1.0 : 1;
+        counts[3 * i + k] = inside ? tables.gaussian.counts[tables.gaussian.first_count[table] + fine + radius] + 1.0 : 1;
       }
     }
     stream.begin();
