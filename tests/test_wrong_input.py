@@ -112,7 +112,7 @@ ROWS = [
     Row("truncate {grey.swz} --packets 1 --out {new}.swz", "it declares no cuts"),
     Row("decode {grey.swz} --hash --out {new}.ply", "leave out --out and --json"),
     Row("compress {grey.swz} --size much --out {new}.swz", "size 'much' is none"),
-    Row("lod {grey.swz} --out {new}.swz", "lod-meta.json"),
+    Row("lod {grey.swz} --out {new}.swz --levels 3", "--levels"),
     Row("lod {cut.ply} --out {new}/lod-meta.json", "cut.ply"),
     Row("lod {grey.swz} --out {new}/lod-meta.json --chunk 8mb", "no number of Gaussians"),
     Row("compress {cut.ply} --size 1MB --out {new}.swz", "cut.ply"),

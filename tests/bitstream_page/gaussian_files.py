@@ -39,6 +39,24 @@ def quantized(static: dict[str, Any], sections: dict[str, bytes]) -> dict[str, n
     return {**joined, "log_scales": joined["log_scales"] + np.float32(swell)}
 
 
+def tiles(static: dict[str, Any], sections: dict[str, bytes]) -> dict[str, np.ndarray]:
+    check(sum(n for _, n, _ in static["groups"]) == static["num_gaussians"], "rows of the groups")
+    parts: list[dict[str, np.ndarray]] = []
+    last: dict[int, float] = {}
+    tile_of: list[int] = []
+    for number, (tile, n, g) in enumerate([(-1, sum(static["base"]), 0.0), *static["groups"]], 1):
+        part = {name.partition("/")[2]: data for name, data in sections.items() if name.startswith(f"{number}/")}
+        if part:
+            parts.append(quantized_rows({**static, "num_gaussians": n}, part))
+            tile_of += [tile] * n
+            last[tile] = g
+    base = [tile not in last for tile, n in enumerate(static["base"]) for _ in range(n)]
+    keep = np.array(base + [True] * (len(tile_of) - len(base)))
+    joined = {name: np.concatenate([part[name] for part in parts])[keep] for name in parts[0]}
+    grown = np.array([last[tile] for tile in tile_of], np.float32)[keep]
+    return {**joined, "log_scales": joined["log_scales"] + grown[:, None]}
+
+
 def quantized_rows(static: dict[str, Any], sections: dict[str, bytes]) -> dict[str, np.ndarray]:
     n, active = static["num_gaussians"], static["active_sh_degree"]
     points = octree(sections["positions"])

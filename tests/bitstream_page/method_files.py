@@ -20,6 +20,7 @@ from bitstream_page.gaussian_files import (
     ply,
     quantized,
     raht,
+    tiles,
     vectree,
 )
 from bitstream_page.splat_files import wisp
@@ -39,6 +40,8 @@ def decode(data: bytes, unzstd: Callable[[bytes], bytes], tables: ExactTables) -
     if header["method"] == "wisp":
         return wisp(static, sections, tables)
     if header["method"] == "3dgs":
+        if static.get("codec") == "gaussians-tiles":
+            return tiles(static, sections)
         check(static["mode"] in ("exact", "quantized"), "mode")
         return exact_mode(static, sections) if static["mode"] == "exact" else quantized(static, sections)
     if header["method"] == "chimerags":

@@ -304,6 +304,17 @@ CASES: dict[str, Case] = {
     "3dgs_coincident_v1": ("3dgs", "r3", {"codec.position_bits": 9}, coincident),
     "3dgs_classes_v1": ("3dgs", "r1", {"codec.position_bits": 8}, orderly),
     "3dgs_packets_v1": ("3dgs", "r3", {"codec.settings.prefixes": 4}, lambda: procedural(24, 1)),
+    "3dgs_tiles_v1": (
+        "3dgs",
+        "r3",
+        {
+            "codec.name": "gaussians-tiles",
+            "codec.settings.rows": 8,
+            "codec.settings.coarsest": 10,
+            "codec.settings.layers": 2,
+        },
+        lambda: procedural(14, 1),
+    ),
     "pruned_3dgs_v1": ("pruned-3dgs", "r3", {}, lambda: procedural(5, 1)),
     "trimming_the_fat_ply_v1": ("trimming-the-fat", "r3", {"codec": "gaussians-ply"}, lambda: procedural(5, 1)),
     "trimming_the_fat_zstd_v1": ("trimming-the-fat", "r1", {"codec": "gaussians-zstd"}, lambda: procedural(24, 1, 0)),

@@ -51,7 +51,7 @@ class Leaf:
 
 @dataclass(frozen=True)
 class Index:
-    """What a lod-meta.json says.
+    """Content of a lod-meta.json.
 
     levels      how many there are, the finest is 0
     counts      Gaussians of each level, without the environment
@@ -141,7 +141,7 @@ def _selected(ranges: list[Rows], count: int, name: str) -> npt.NDArray[np.intp]
 
 
 class _RefusedError(Exception):
-    """What is wrong with an index; the reader adds its name."""
+    """Fault of an index; the reader adds its name."""
 
 
 def _index(found: Any, name: str) -> Index:

@@ -27,23 +27,31 @@ class Count(click.ParamType):  # type: ignore[type-arg]  # generic only in new r
 @click.argument("file", metavar="FILE", type=EXISTING)
 @options(
     click.option("--out", metavar="PATH", required=True, type=click.Path(),
-                 help="DIR/lod-meta.json: streamed SOG, for SuperSplat's viewer and the PlayCanvas engine."),
+                 help="DIR/lod-meta.json: streamed SOG, for SuperSplat's viewer and PlayCanvas. Or FILE.swz."),
     click.option("--levels", type=click.IntRange(1, 64), metavar="N",
-                 help="How many, each half of the one before.  [default: down to a 64th, at least 20,000]"),
-    click.option("--chunk", type=Count(), default="64k", show_default=True, metavar="N",
-                 help="Gaussians of a piece at most, all its levels together."),
+                 help="Of streamed SOG, each half of the one before.  [default: down to a 64th, at least 20,000]"),
+    click.option("--chunk", type=Count(), metavar="N",
+                 help="Gaussians of a piece at most, all its levels together.  [default: 64k; of a .swz 16k]"),
     device_option, json_option, debug_option,
 )  # fmt: skip
-def lod(file: Path, out: str, levels: int | None, chunk: int, device: str | None, as_json: bool) -> None:
+def lod(file: Path, out: str, levels: int | None, chunk: int | None, device: str | None, as_json: bool) -> None:
     """Write FILE in levels of detail and in pieces: a viewer loads what it shows, as finely as it needs.
 
     FILE is any splat file: .ply, .spz, .splat, .sog, .ksplat, .glb, or a .swz of explicit Gaussians. Each level has
     half as many Gaussians as the finer one: neighbours merge where it shows least. The pieces of a level lie in folders
     beside the index, each a SOG of its own.
+
+    A .swz has the whole scene coarsely, then piece by piece as it is: a file that ends after any of them is a scene
+    (`sw info`, `sw truncate`, `sw decode --packets`).
     """
     from sw_lod.writing import write_lod
 
     record = write_lod(file, out, levels=levels, chunk=chunk, device=device or "auto", say=say)
+    if "packets" in record:
+        ends = record["packets"]
+        told = f"{record['out']}: {ends[-1]:,} bytes in {len(ends)} packets, the whole scene coarsely in {ends[0]:,}"
+        print_facts(record, as_json, told)
+        return
     counts = ", ".join(f"{count:,}" for count in record["counts"])
     told = (
         f"{record['out']}: {len(record['counts'])} levels ({counts} Gaussians) in {record['leaves']} pieces, "

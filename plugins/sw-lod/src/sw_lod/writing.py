@@ -9,15 +9,24 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from sw_gaussians.render_options import antialias_of, eps2d_of
 from sw_gaussians.simplifying import level_counts, merged_to
 from sw_gaussians.surfels import refuse_surfels
 from sw_interchange.bridge import from_gaussians
 from sw_interchange.known_formats import INDEX
 
-from splatwizard_core.api import GaussianModel, SceneError, UserInputError
+from splatwizard_core.api import (
+    ContainerReader,
+    GaussianModel,
+    RasterOptions,
+    SceneError,
+    UserInputError,
+    create_method,
+)
 from splatwizard_core.tooling import (
     OUTPUT_FOLDER,
     choose_device,
+    encode,
     existing_file,
     load_plugins,
     open_model,
@@ -25,6 +34,7 @@ from splatwizard_core.tooling import (
 )
 from sw_lod.streamed import write_streamed
 
+SWZ = ".swz"
 CHUNK = 65_536
 SMALLEST_CHUNK = 256
 FAINTEST = 1 / 255
@@ -33,14 +43,15 @@ FAINTEST = 1 / 255
 
 def write_lod(
     given: str | os.PathLike[str] | GaussianModel, out: str | os.PathLike[str], *, levels: int | None = None,
-    chunk: int = CHUNK, device: str = "auto", say: Callable[[str], None] = lambda _: None,
+    chunk: int | None = None, device: str = "auto", say: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:  # fmt: skip
     """Write a scene in levels, each half as many Gaussians as the finer one, merged from it, and in places.
 
     given   a splat file, or a model of Gaussians
-    out     DIR/lod-meta.json: streamed SOG, as the SuperSplat viewer takes it; DIR is made if need be
-    levels  how many; None: down to a 64th of the scene, or to 20,000 Gaussians if that is more
-    chunk   Gaussians of a place at most, all levels together
+    out     DIR/lod-meta.json: streamed SOG, as the SuperSplat viewer takes it; DIR is made if need be. Or FILE.swz:
+            coarse first, then place by place, by the codec `gaussians-tiles`
+    levels  how many; None: down to a 64th of the scene, or to 20,000 Gaussians if that is more. Not of a .swz
+    chunk   Gaussians of a place at most, all levels together; None: 65,536, in a .swz 16,384
 
     Returns the record. Raises UserInputError, SceneError, BitstreamError.
     """
@@ -48,8 +59,12 @@ def write_lod(
     target = _target(out)
     if levels is not None and not 1 <= levels <= 64:
         raise UserInputError(f"--levels {levels}: 1 to 64 are possible")
-    if chunk < SMALLEST_CHUNK:
+    if chunk is not None and chunk < SMALLEST_CHUNK:
         raise UserInputError(f"--chunk {chunk}: at least {SMALLEST_CHUNK}")
+    if target.suffix == SWZ:
+        if levels is not None:
+            raise UserInputError(f"--levels {levels}: a {SWZ} has the scene and what comes first of it, no levels")
+        return _write_tiles(given, target, chunk, device, started)
     model, name = _opened(given, device)
     counts = level_counts(model.num_rows, levels)
     scenes = [from_gaussians(model)]
@@ -59,17 +74,32 @@ def write_lod(
         say(f"level {level}: {count:,} Gaussians")
     merged = time.perf_counter()
     target.parent.mkdir(parents=True, exist_ok=True)
-    facts = write_streamed(scenes, target, chunk=chunk, say=say)
+    facts = write_streamed(scenes, target, chunk=chunk or CHUNK, say=say)
     ended = time.perf_counter()
     seconds = {"merge": round(merged - started, 3), "write": round(ended - merged, 3)}
     return {"source": {"file": name, "gaussians": scenes[0].num_gaussians}, "out": str(target), **facts,
             "seconds": seconds}  # fmt: skip
 
 
+def _write_tiles(
+    given: str | os.PathLike[str] | GaussianModel, target: Path, chunk: int | None, device: str, started: float
+) -> dict[str, Any]:
+    model, name = _opened(given, device)
+    values = {"codec.name": "gaussians-tiles", **({} if chunk is None else {"codec.settings.rows": chunk})}
+    origin = model.world_origin or (0.0, 0.0, 0.0)
+    raster: dict[str, Any] = {"antialias": True} if antialias_of(model) else {}
+    if (eps2d := eps2d_of(model)) != RasterOptions().eps2d:
+        raster["eps2d"] = eps2d
+    facts = encode(create_method(load_plugins(), "3dgs", values), model, raster, target, origin)
+    ends = [cut["bytes"] for cut in ContainerReader.open(target).summary()["cuts"]]
+    return {"source": {"file": name, "gaussians": model.num_rows}, "out": str(target), "bytes": facts.bytes,
+            "packets": ends, "warnings": [], "seconds": {"write": round(time.perf_counter() - started, 3)}}  # fmt: skip
+
+
 def _target(out: str | os.PathLike[str]) -> Path:
     target = Path(out)
-    if target.name != INDEX:
-        raise UserInputError(f"{target}: levels are written as DIR/{INDEX}: name that file, in a folder of its own")
+    if target.name != INDEX and target.suffix != SWZ:
+        raise UserInputError(f"{target}: levels are written as DIR/{INDEX}, in a folder of its own, or as FILE{SWZ}")
     if target.is_dir():
         raise UserInputError(f"{target} is a folder: give the name of a file in it")
     OUTPUT_FOLDER.check(target.parent)

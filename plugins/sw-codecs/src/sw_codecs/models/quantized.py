@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -34,7 +34,7 @@ from sw_codecs.models.position_grid import MAX_TOP, PositionGrid
 
 if TYPE_CHECKING:
     from splatwizard_core.api import ContainerReader, ContainerWriter, EntropyModel, PluginManager, PositionCodec
-    from sw_codecs.models.settings import QuantizedSettings
+    from sw_codecs.models.settings import LatticeSettings, QuantizedSettings
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +45,8 @@ SECTIONS = ("color", "opacity", "scales", "quats")
 """Sections of the first columns of the attribute matrix; SH bands 1 to 3 follow with one section each."""
 
 SMALLEST_PREFIX = 1 / 16
-"""The first of n packets holds this share of the Gaussians to the power 1 - 1/n, the first two to the power 1 - 2/n."""
+"""The first of n packets holds this share of the Gaussians to the power 1 - 1/n, the first two to the power 1 - 2/n;
+usually."""
 
 ROWS_AT_ONCE = 1 << 12
 """Rows that are dequantised together: intermediate doubles of all rows would outweigh the model several times."""
@@ -106,6 +107,9 @@ class Layout(Params):
         return Steps(self.dc_step, self.rest_step, self.opacity_step, self.scale_step, self.quat_step)
 
 
+AnyLayout = TypeVar("AnyLayout", bound=Layout)
+
+
 def encode(model: GaussianModel, writer: ContainerWriter, settings: QuantizedSettings, plugins: PluginManager) -> None:
     """Sections positions, color, opacity, scales, quats, sh1 .. sh<active degree>; of packets 1/positions and so on."""
     positions = plugins.position_codecs.load(settings.positions)()
@@ -120,17 +124,18 @@ def encode(model: GaussianModel, writer: ContainerWriter, settings: QuantizedSet
     settings.state(writer)
     columns = plugins.entropy_models.load(settings.entropy)()
     if not packets:
-        _encode_rows(layout, cells, symbols, "", writer, positions, columns)
+        encode_rows(layout, cells, symbols, "", writer, positions, columns)
     for number, rows in enumerate(packets, 1):
-        _encode_rows(layout, cells[rows], symbols[rows], f"{number}/", writer, positions, columns)
+        encode_rows(layout, cells[rows], symbols[rows], f"{number}/", writer, positions, columns)
         writer.cut()
     writer.allow(layout.decoded_bytes, f"a model of {layout.num_gaussians:,} Gaussians")
 
 
-def _encode_rows(
+def encode_rows(
     layout: Layout, cells: NDArray[np.int64], symbols: NDArray[np.int32], prefix: str, writer: ContainerWriter,
     positions: PositionCodec, columns: EntropyModel,
 ) -> None:  # fmt: skip
+    """Write the sections of rows of the lattice, which lie in the order of their positions."""
     writer.add(f"{prefix}positions", positions.encode(cells, layout.position_bits))
     for name, (start, stop) in layout.sections.items():
         writer.add(f"{prefix}{name}", columns.encode(symbols[:, start:stop], None))
@@ -140,7 +145,7 @@ def _encode_rows(
 
 
 def significant_first(
-    layout: Layout, symbols: NDArray[np.int32], count: int
+    layout: Layout, symbols: NDArray[np.int32], count: int, smallest: float = SMALLEST_PREFIX
 ) -> tuple[list[NDArray[np.int64]], list[float]]:
     """Return the rows of each of `count` packets, ascending in each, and how much log scales grow after it.
 
@@ -148,20 +153,29 @@ def significant_first(
     largest scales. The packets up to a place hold a share of all rows that grows by the same factor each time. Scales
     grow so that what is there covers as much as all will.
     """
-    opacity = 1 / (1 + np.exp(-layout.opacity_step * symbols[:, 3].astype(np.float64)))
-    log_area = layout.scale_step * symbols[:, SCALES_FROM : SCALES_FROM + 2].astype(np.float64).sum(axis=1)
-    covered = opacity * np.exp(log_area - log_area.max(initial=-np.inf))
+    covered = coverage(layout, symbols)
     order = np.argsort(-covered, kind="stable")
-    shares = [SMALLEST_PREFIX ** (1 - number / count) for number in range(1, count + 1)]
+    shares = [smallest ** (1 - number / count) for number in range(1, count + 1)]
     ends = [round(share * len(order)) for share in shares]
     packets = [np.sort(order[start:end]) for start, end in zip([0, *ends], ends, strict=False)]
     sums = np.cumsum(covered[order])
     return packets, [round(0.5 * math.log(sums[-1] / sums[end - 1]), 4) if end else 0.0 for end in ends]
 
 
+def coverage(layout: Layout, symbols: NDArray[np.int32]) -> NDArray[np.float64]:
+    """Area that each row covers: opacity times the product of its first two scales, relative to the largest product."""
+    opacity = 1 / (1 + np.exp(-layout.opacity_step * symbols[:, 3].astype(np.float64)))
+    log_area = layout.scale_step * symbols[:, SCALES_FROM : SCALES_FROM + 2].astype(np.float64).sum(axis=1)
+    found: NDArray[np.float64] = opacity * np.exp(log_area - log_area.max(initial=-np.inf))
+    return found
+
+
 def decode(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
     """The model on the lattice, of a file that ends at a cut that of its first packets. Raises BitstreamError."""
-    layout = _layout(reader)
+    layout = parsed(reader, Layout)
+    told = layout.packets
+    if len(told or ()) != len(reader.cuts) or (told and sum(n for n, _ in told) != layout.num_gaussians):
+        raise BitstreamError(f"{reader.name}: cuts, packets and their Gaussians do not fit together", section="header")
     packets = {"": layout.num_gaussians}
     if layout.packets is not None:
         packets = {f"{number}/": rows for number, (rows, _) in enumerate(layout.packets[: reader.packets], 1)}
@@ -173,16 +187,20 @@ def decode(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
     end = 0
     for prefix, rows in packets.items():
         start, end = end, end + rows
-        _decode_rows(layout, cells[start:end], symbols[start:end], prefix, reader, plugins)
+        decode_rows(layout, cells[start:end], symbols[start:end], prefix, reader, plugins)
     swell = layout.packets[reader.packets - 1][1] if layout.packets is not None else 0.0
-    model = reconstruct(layout, cells, symbols, swell)
+    return finite(reconstruct(layout, cells, symbols, swell), reader)
+
+
+def finite(model: GaussianModel, reader: ContainerReader) -> GaussianModel:
+    """The model. Raises BitstreamError if a number of it is not finite."""
     for name, parameter in model.named_parameters():
         if not bool(torch.isfinite(parameter).all()):
             raise BitstreamError(f"{reader.name}: decoded '{name}' is not finite: the file is damaged or hostile")
     return model
 
 
-def _decode_rows(
+def decode_rows(
     layout: Layout, cells: NDArray[np.int64], symbols: NDArray[np.int32], prefix: str, reader: ContainerReader,
     plugins: PluginManager,
 ) -> None:  # fmt: skip
@@ -206,9 +224,13 @@ def _decode_rows(
 
 
 def lattice(
-    model: GaussianModel, settings: QuantizedSettings, sort: Callable[[NDArray[np.int64]], NDArray[np.int64]]
-) -> tuple[Layout, NDArray[np.int64], NDArray[np.int32]]:
-    """Header, grid cells [N,3] in the order of `sort`, and integers of the attributes [N,C] likewise."""
+    model: GaussianModel, settings: LatticeSettings, sort: Callable[[NDArray[np.int64]], NDArray[np.int64]],
+    grid: PositionGrid | None = None,
+) -> tuple[Layout, NDArray[np.int64], NDArray[np.int32]]:  # fmt: skip
+    """Header, grid cells [N,3] in the order of `sort`, and integers of the attributes [N,C] likewise.
+
+    grid    of the positions; None: the one that fits them
+    """
     arrays = {name: getattr(model, name).detach().cpu().numpy() for name in model.RAW}
     keep = arrays["opacity_logits"] >= FAINTEST
     for array in arrays.values():
@@ -218,7 +240,7 @@ def lattice(
     if not keep.all():
         log.info("%d of %d Gaussians can never be drawn and are left out", int((~keep).sum()), len(keep))
     arrays = {name: array[keep] for name, array in arrays.items()}
-    grid = PositionGrid.fit(arrays["means"], settings.position_bits)
+    grid = PositionGrid.fit(arrays["means"], settings.position_bits) if grid is None else grid
     cells = grid.quantize(arrays["means"])
     order = sort(cells)
     active = (model.active_sh_degree + 1) ** 2 - 1
@@ -249,9 +271,9 @@ def lattice(
 
 
 def reconstruct(
-    layout: Layout, cells: NDArray[np.int64], symbols: NDArray[np.int32], swell: float = 0.0
+    layout: Layout, cells: NDArray[np.int64], symbols: NDArray[np.int32], swell: float | NDArray[np.float32] = 0.0
 ) -> GaussianModel:
-    """The model that these integers stand for, with so much on its log scales; what the decoder returns."""
+    """The model that these integers stand for, with so much on its log scales, of all or [N,1]; for the decoder."""
     n, grid, steps = layout.num_gaussians, layout.grid, layout.steps
     tails = {"means": (3,), "dc": (3,), "rest": ((layout.max_sh_degree + 1) ** 2 - 1, 3), "opacity_logits": (),
              "log_scales": (layout.scales,), "quats": (4,)}  # fmt: skip
@@ -264,7 +286,7 @@ def reconstruct(
         found["rest"][part, : values.rest.shape[1]] = values.rest
         for name in ("dc", "opacity_logits", "log_scales", "quats"):
             found[name][part] = getattr(values, name)
-    found["log_scales"] += np.float32(swell)
+    found["log_scales"] += np.asarray(swell, dtype=np.float32)
     found["dc"] = found["dc"][:, None, :]
     return gaussians_of(
         *(torch.from_numpy(array) for array in found.values()), active_sh_degree=layout.active_sh_degree
@@ -290,16 +312,14 @@ BESIDE = (*Exchangeable.USUAL, "mode", "codec", "method", "depth_ratio", "lambda
 """Header values that a method keeps beside the codec's own."""
 
 
-def _layout(reader: ContainerReader) -> Layout:
+def parsed(reader: ContainerReader, kind: type[AnyLayout]) -> AnyLayout:
+    """Header values of a file. Raises BitstreamError for those that make no sense."""
     try:
-        layout = Layout.model_validate({key: value for key, value in reader.static.items() if key not in BESIDE})
+        layout = kind.model_validate({key: value for key, value in reader.static.items() if key not in BESIDE})
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
         raise BitstreamError(f"{reader.name}: header value '{key}': {first['msg']}", section="header") from None
-    packets = layout.packets
-    if len(packets or ()) != len(reader.cuts) or (packets and sum(n for n, _ in packets) != layout.num_gaussians):
-        raise BitstreamError(f"{reader.name}: cuts, packets and their Gaussians do not fit together", section="header")
     if layout.active_sh_degree > layout.max_sh_degree:
         raise BitstreamError(f"{reader.name}: header activates more SH bands than there are", section="header")
     grid_fits = (

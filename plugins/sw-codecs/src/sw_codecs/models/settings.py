@@ -5,8 +5,8 @@ from pydantic import Field
 from sw_codecs.models.exchangeable import Exchangeable
 
 
-class QuantizedSettings(Exchangeable):
-    """Grid of the positions, quantiser steps of all else, what codes both, and in how many packets."""
+class LatticeSettings(Exchangeable):
+    """Grid of the positions, quantiser steps of all else, and what codes both."""
 
     position_bits: int = Field(18, ge=8, le=21, description="bits per axis of the position grid")
     dc_step: float = Field(
@@ -16,6 +16,11 @@ class QuantizedSettings(Exchangeable):
     opacity_step: float = Field(0.08, ge=1e-6, le=1e3, description="quantiser step of the opacity logits")
     scale_step: float = Field(0.03, ge=1e-6, le=1e3, description="quantiser step of the log scales (0.03: 3 % in size)")
     quat_step: float = Field(0.007, ge=1e-6, le=0.5, description="quantiser step of the unit quaternion's x, y, z")
+
+
+class QuantizedSettings(LatticeSettings):
+    """Of the file in one piece or in packets."""
+
     prefixes: int = Field(
         0,
         ge=0,
