@@ -5,8 +5,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from sw_gaussians import face, simplifying
 from sw_gaussians.merge_costs import closeness, columns_of, prices
 from sw_gaussians.merging import Splats, covariances, merge_groups, surface
+from sw_gaussians.native import GAUSSIANS
 from sw_gaussians.simplifying import level_counts, merged_to
 
 from splatwizard_core.api import GaussianModel
@@ -220,3 +222,32 @@ def test_levels_halve_down_to_a_64th_or_20_000():
     assert level_counts(10_000_000)[-1] == 156_250
     assert level_counts(30_000) == [30_000]
     assert level_counts(9, 3) == [9, 5, 3]
+
+
+@pytest.mark.parametrize("bands", [1, 4])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_native_partners_are_those_of_the_plain_version(bands, weighted):
+    if not GAUSSIANS.try_load():
+        pytest.skip("no compiled kernels")
+    splats = Splats(*(each[:, 0].float() for each in random_splats(3000, 1)))
+    splats = splats._replace(sh=splats.sh[:, :bands], opacities=splats.opacities * (torch.arange(3000) > 5))
+    splats = splats.rows(simplifying._curve(splats.means, 0))
+    weights = torch.rand(3000, generator=torch.Generator().manual_seed(1)) if weighted else None
+    (plain, theirs), (native, ours) = (
+        find(splats, weights, 1.0, 4.0, 2) for find in (simplifying._partners, simplifying._native_partners)
+    )
+    assert torch.equal(plain.isinf(), native.isinf())
+    assert (theirs == ours).float().mean() > 0.995  # float32: prices that are nearly equal
+    there = plain.isfinite()
+    close = torch.isclose(native[there], plain[there], rtol=0.01, atol=1e-6)
+    assert close.float().mean() > 0.99  # float32 of either is some percent off for few
+    assert int(plain.isinf().sum()) < 2900
+
+
+def test_a_window_that_is_none_is_refused():
+    if not GAUSSIANS.try_load():
+        pytest.skip("no compiled kernels")
+    table, sh = torch.zeros(2, 15), torch.zeros(2, 3)
+    with pytest.raises(RuntimeError, match="a window of 0"):
+        face.merge_partners(table=table, sh=sh, weights=None, window=0, wave=0, near=4.0, prices=torch.zeros(2, 0),
+                            best=torch.zeros(2), partner=torch.zeros(2, dtype=torch.int64))  # fmt: skip

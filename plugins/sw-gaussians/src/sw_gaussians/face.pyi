@@ -23,3 +23,17 @@ def sparse_adam(
     marked: Tensor | Array[Any] | int,
     rows: int | None = None,
 ) -> Structure: ...
+def merge_partners(
+    *,
+    table: Tensor | Array[Any] | int,
+    sh: Tensor | Array[Any] | int,
+    weights: Tensor | Array[Any] | int | None = None,
+    rows: int | None = None,
+    width: int | None = None,
+    window: int | None = None,
+    wave: int,
+    near: float,
+    prices: Tensor | Array[Any] | int,
+    best: Tensor | Array[Any] | int,
+    partner: Tensor | Array[Any] | int,
+) -> Structure: ...

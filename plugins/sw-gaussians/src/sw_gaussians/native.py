@@ -1,4 +1,4 @@
-"""Native module of this package: sparse Adam; on CUDA also gradient statistics and normals."""
+"""Native module of this package: sparse Adam, prices of merging; on CUDA also gradient statistics and normals."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ GAUSSIANS = NativeModule(
     package="sw_gaussians",
     face="kernels/face.h",
     sources=("kernels/face.cpp",),
-    kernels=("kernels/sparse_adam.cpp",),
+    kernels=("kernels/sparse_adam.cpp", "kernels/merge_partners.cpp"),
     headers=("kernels/*.h",),
     cflags=("-fno-math-errno", "-fno-trapping-math"),  # without these GCC keeps sqrt and division out of vector code
-    without="sparse Adam runs on torch operations: the same numbers, slower",
+    without="sparse Adam and merging run on torch operations: the same numbers, slower",
     cuda=NativeModule(
         name="splatwizard_gaussians_cuda",
         package="sw_gaussians",

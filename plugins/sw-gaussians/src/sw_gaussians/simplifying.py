@@ -13,10 +13,12 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.api import GaussianModel
+from sw_gaussians import face
 from sw_gaussians.made_up_cameras import extent_of
 from sw_gaussians.merge_costs import closeness, columns_of, prices
 from sw_gaussians.merging import Splats, merge_groups, model_of, splats_of
 from sw_gaussians.morton import interleave
+from sw_gaussians.native import GAUSSIANS
 
 WINDOW = 8
 """Neighbours along the curve, before and behind, that a Gaussian may merge with in a wave."""
@@ -99,9 +101,35 @@ def _curve(points: Tensor, wave: int) -> Tensor:
 
 def _wave(splats: Splats, weights: Tensor | None, unit: float, near: float, wave: int) -> Tensor:
     """Pairs [P,2] of rows that are each other's cheapest neighbours, the cheapest first."""
-    columns, n = columns_of(splats, unit), len(splats.means)
-    device = splats.means.device
-    best = torch.full((n,), math.inf, dtype=splats.means.dtype, device=device)
+    native = splats.means.device.type == "cpu" and splats.means.dtype == torch.float32 and GAUSSIANS.try_load()
+    best, partner = (_native_partners if native else _partners)(splats, weights, unit, near, wave)
+    rows = torch.arange(len(best), device=best.device)
+    first = rows[(partner > rows) & (partner[partner] == rows)]
+    first = first[torch.argsort(best[first], stable=True)]
+    return torch.stack([first, partner[first]], dim=1)
+
+
+def _native_partners(
+    splats: Splats, weights: Tensor | None, unit: float, near: float, wave: int
+) -> tuple[Tensor, Tensor]:
+    """The same as `_partners`, of Gaussians in float32 on the CPU."""
+    columns = columns_of(splats._replace(sh=splats.sh[:, :1]), unit)
+    single = (columns.volumes[None], columns.masses[None], columns.opacities[None])
+    table = torch.cat([columns.places, columns.six, *single, columns.colors]).T.contiguous()
+    n, best = len(table), table.new_empty(len(table))
+    partner = torch.empty(n, dtype=torch.int64)
+    face.merge_partners(
+        table=table, sh=splats.sh.flatten(1).contiguous(), weights=weights, window=WINDOW, wave=wave, near=near,
+        prices=table.new_empty(n, WINDOW), best=best, partner=partner,
+    )  # fmt: skip
+    return best, partner
+
+
+def _partners(splats: Splats, weights: Tensor | None, unit: float, near: float, wave: int) -> tuple[Tensor, Tensor]:
+    """The price [N] of the cheapest neighbour of each row, infinite if none is near, and its row [N], then its own."""
+    columns = columns_of(splats, unit)
+    n, device = len(columns.opacities), columns.places.device
+    best = torch.full((n,), math.inf, dtype=columns.places.dtype, device=device)
     partner = torch.arange(n, device=device)
     step = ROWS_AT_ONCE["cpu" if device.type == "cpu" else "cuda"]
     for start in range(0, n, step):
@@ -122,10 +150,7 @@ def _wave(splats: Splats, weights: Tensor | None, unit: float, near: float, wave
                 better = price < best[here]
                 best[here] = torch.where(better, price, best[here])
                 partner[here] = torch.where(better, theirs, partner[here])
-    rows = torch.arange(n, device=device)
-    first = rows[(partner > rows) & (partner[partner] == rows)]
-    first = first[torch.argsort(best[first], stable=True)]
-    return torch.stack([first, partner[first]], dim=1)
+    return best, partner
 
 
 def _lot(rows: Tensor, offset: int, wave: int) -> Tensor:

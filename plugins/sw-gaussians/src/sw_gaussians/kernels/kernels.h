@@ -22,10 +22,24 @@ struct SparseAdamArgs {
   float eps;
 };
 
+// The cheapest neighbour of each row of a [rows, 15] table along a curve.
+struct MergePartnersArgs {
+  const float* table;
+  const float* sh;       // [rows, width], three of band 0 first
+  const float* weights;  // [rows] or null
+  int64_t rows, width, window;
+  uint32_t wave;
+  float near;
+  float* prices;  // [rows, window] those of a row with the next ones
+  float* best;
+  int64_t* partner;
+};
+
 }  // namespace splatwizard
 
 #define SW_DECLARE_GAUSSIANS(arch)                                                                    \
   namespace arch {                                                                                    \
   void sparse_adam(const splatwizard::SparseAdamArgs& args, const splatwizard::Parallel& parallel);  \
+  void merge_partners(const splatwizard::MergePartnersArgs& args, const splatwizard::Parallel& parallel); \
   }
 SW_FOR_EACH_ARCH(SW_DECLARE_GAUSSIANS)
