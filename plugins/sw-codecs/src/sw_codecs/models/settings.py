@@ -16,6 +16,13 @@ class QuantizedSettings(Exchangeable):
     opacity_step: float = Field(0.08, ge=1e-6, le=1e3, description="quantiser step of the opacity logits")
     scale_step: float = Field(0.03, ge=1e-6, le=1e3, description="quantiser step of the log scales (0.03: 3 % in size)")
     quat_step: float = Field(0.007, ge=1e-6, le=0.5, description="quantiser step of the unit quaternion's x, y, z")
+    precision_power: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="power of a Gaussian's weight in pictures by which its steps fall; 0: all have the same steps",
+    )
+    sh_basis: bool = Field(False, description="SH bands 1 to 3 in a basis of the scene's own, where that is smaller")
     prefixes: int = Field(
         0,
         ge=0,
