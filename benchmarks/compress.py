@@ -1,6 +1,7 @@
 """Bytes of `sw compress` at the rendered quality of .spz and .sog files of the same scene, as ratios.
 
     python benchmarks/compress.py garden.ply room.ply [--device cpu] [--json FILE]
+    python benchmarks/compress.py garden.ply --of "spz 8-bit SH" --without precision --without basis
 
 Each scene is written as .spz (version 3 and 4, and with 8-bit spherical harmonics) and .sog as other programs write
 them; each of these is drawn from cameras that were made up, and `sw compress --quality` is asked for the same PSNR
@@ -17,10 +18,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from sw_compress import coders, search
 from sw_compress.compressing import compress
 from sw_compress.quality import Pictures
 from sw_compress.source import open_source
-from sw_compress.views import views_of
+from sw_compress.views import made_up_views
 from sw_interchange import decode, encode, from_gaussians, to_gaussians
 
 from splatwizard_core.api import RasterOptions, UserInputError
@@ -36,18 +38,23 @@ LARGEST_QUALITY = 69.0
 """dB; `sw compress` takes no more."""
 
 
-def compared(path: Path, device: str) -> list[dict[str, Any]]:
+PARTS = {"precision": ("PRECISION_POWER", 0.0), "basis": ("OWN_BASIS", False), "pruning": ("SHARES", (1.0,))}
+"""What `--without` takes away, as a constant of sw-compress and its value without."""
+
+
+def compared(path: Path, device: str, baselines: list[str]) -> list[dict[str, Any]]:
     """Bytes and dB of each baseline of a scene, and those of `sw compress` at that quality."""
     plugins = load_plugins()
     chosen = choose_device(device, plugins)
     source = open_source(path, plugins, chosen)
     rasterizer = NegotiatedRasterizer(plugins, device=chosen, options=source.raster)
     with torch.no_grad():
-        seen = views_of(source.model, rasterizer, None, None)
+        seen = made_up_views(source.model, rasterizer, None)
         held_out = Pictures(source.model, seen.held_out, rasterizer, RasterOptions(alpha=True))
     scene = from_gaussians(source.model)
     rows = []
-    for name, (form, options) in BASELINES.items():
+    for name in baselines:
+        form, options = BASELINES[name]
         data, _ = encode(scene, form, **options)
         found = held_out.quality(to_gaussians(decode(data, form)).to(chosen))
         row: dict[str, Any] = {
@@ -85,9 +92,14 @@ def main() -> None:
     parser.add_argument("scenes", nargs="+", type=Path)
     parser.add_argument("--device", default="auto")
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--of", action="append", choices=BASELINES, help="only this baseline; may be repeated")
+    parser.add_argument("--without", action="append", choices=PARTS, default=[], help="without a part of sw compress")
     given = parser.parse_args()
+    for part in given.without:
+        name, value = PARTS[part]
+        setattr(search if part == "pruning" else coders, name, value)
     print("scene        gaussians file                bytes  quality |        ours quality    gaussians | ratio | time")
-    rows = [row for path in given.scenes for row in compared(path, given.device)]
+    rows = [row for path in given.scenes for row in compared(path, given.device, given.of or list(BASELINES))]
     for name in BASELINES:
         ratios = [row["ratio"] for row in rows if row["baseline"] == name and row["ratio"] is not None]
         if ratios:

@@ -32,6 +32,7 @@ def quantized(static: dict[str, Any], sections: dict[str, bytes]) -> dict[str, n
     swell = 0.0
     for number, (n, g) in enumerate(static["packets"], 1):
         part = {name.partition("/")[2]: data for name, data in sections.items() if name.startswith(f"{number}/")}
+        part |= {name: data for name, data in sections.items() if part and name == "basis"}
         if part:
             found.append(quantized_rows({**static, "num_gaussians": n}, part))
             swell = g
@@ -61,26 +62,41 @@ def quantized_rows(static: dict[str, Any], sections: dict[str, bytes]) -> dict[s
     n, active = static["num_gaussians"], static["active_sh_degree"]
     points = octree(sections["positions"])
     check(len(points) == n, "number of points")
-    scales = scales_of(static)
-    base = {name: np.array(columns(sections[name], n, width), np.float64).reshape(width, n)
+    scales, classes, k, factor = scales_of(static), static["sh_classes"], [0] * n, np.ones(n)
+    by_class = static.get("precision", False)
+    if by_class:
+        k = columns(sections["precision"], n, 1)[0]
+        check(all(-4 <= value <= 4 for value in k), "a class of precision")
+        factor = np.array([2.0 ** -(value // 2) * (0.7071067811865476 if value % 2 else 1.0) for value in k])
+    base = {name: np.array(band_columns(sections[name], n, width, classes, k) if by_class else
+                           columns(sections[name], n, width), np.float64).reshape(width, n)
             for name, width in (("color", 3), ("opacity", 1), ("scales", scales), ("quats", 3))}  # fmt: skip
-    rest = np.zeros((n, (static["max_sh_degree"] + 1) ** 2 - 1, 3), np.float32)
-    activity = [0] * n
+    integers: list[list[int]] = []
     for band in range(1, active + 1):
-        matrix = band_columns(sections[f"sh{band}"], n, band, 1 if band == 1 else static["sh_classes"], activity)
-        activity = [sum(map(abs, row), done) for row, done in zip(zip(*matrix, strict=True), activity, strict=True)]
-        colors = np.array(matrix, np.float64).reshape(2 * band + 1, 3, n) * static["rest_step"]
-        for k, (y, u, v) in enumerate(colors):
-            rest[:, band**2 - 1 + k] = rgb(y, u, v)
-    x, y, z = base["quats"] * static["quat_step"]
+        activity = [sum(map(abs, row)) for row in zip(*integers, strict=True)] if band > 1 else k
+        number = 1 if band == 1 and not by_class else classes
+        integers += band_columns(sections[f"sh{band}"], n, 3 * (2 * band + 1), number, activity)
+    rest = np.zeros((n, (static["max_sh_degree"] + 1) ** 2 - 1, 3), np.float32)
+    if static.get("sh_basis", False):
+        width = len(integers)
+        check(len(sections["basis"]) == width * width, "bytes of the basis")
+        basis = np.frombuffer(sections["basis"], "i1").reshape(width, width).astype(np.int64)
+        sums = (np.array(integers, np.int64).T @ basis).astype(np.float64)
+        step = static["rest_step"] / 127
+        rest[:, : width // 3] = (sums * (step * factor)[:, None]).reshape(n, -1, 3)
+    else:
+        colors = np.array(integers, np.float64).reshape(len(integers) // 3, 3, n) * (static["rest_step"] * factor)
+        for number, (y, u, v) in enumerate(colors):
+            rest[:, number] = rgb(y, u, v)
+    x, y, z = base["quats"] * np.minimum(static["quat_step"] * factor, max(static["quat_step"], 0.5))
     norm = x * x + y * y + z * z
     w, long = np.sqrt(np.maximum(1 - norm, 0)), np.sqrt(np.maximum(norm, 1))
     return {
         "means": np.stack([coordinates(points[:, a], static, a) for a in range(3)], 1),
-        "sh_dc": rgb(*(base["color"] * static["dc_step"]))[:, None],
+        "sh_dc": rgb(*(base["color"] * (static["dc_step"] * factor)))[:, None],
         "sh_rest": rest,
-        "opacity_logits": (base["opacity"][0] * static["opacity_step"]).astype(np.float32),
-        "log_scales": (base["scales"] * static["scale_step"]).T.astype(np.float32),
+        "opacity_logits": (base["opacity"][0] * (static["opacity_step"] * factor)).astype(np.float32),
+        "log_scales": (base["scales"] * (static["scale_step"] * factor)).T.astype(np.float32),
         "quats": np.stack([w / long, x / long, y / long, z / long], 1).astype(np.float32),
     }
 
@@ -100,9 +116,9 @@ def rgb(y: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return np.stack([a * y + b * u + c * v, a * y + 0 * u + d * v, a * y - b * u + c * v], 1).astype(np.float32)
 
 
-def band_columns(section: bytes, n: int, band: int, classes: int, activity: list[int]) -> list[list[int]]:
-    """The columns of one SH band, rows of all classes in place."""
-    file, width = Bytes(section), 3 * (2 * band + 1)
+def band_columns(section: bytes, n: int, width: int, classes: int, activity: list[int]) -> list[list[int]]:
+    """Columns in classes, rows of all in place."""
+    file = Bytes(section)
     lengths = file.unpack("I" * classes)
     limits = [sorted(activity)[n * i // classes] for i in range(1, classes)] if n else []
     class_of = [bisect.bisect_right(limits, value) for value in activity]

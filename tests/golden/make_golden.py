@@ -99,6 +99,27 @@ def orderly() -> GaussianModel:
     return GaussianModel(means, torch.zeros(4096, 1, 3), rest, torch.ones(4096), torch.full((4096, 3), -2.0), quats)
 
 
+def tinted(n: int) -> GaussianModel:
+    """Scattered Gaussians whose higher SH coefficients are multiples of a few."""
+    model = procedural(n, 2)
+    with torch.no_grad():
+        strength, sides = Scattered()(n, 1), torch.arange(24) % 5 - 2.0
+        model.sh_rest.copy_((strength * sides + model.sh_rest.flatten(1) / 16).unflatten(1, (8, 3)))
+    return model
+
+
+def graded() -> GaussianModel:
+    """4,096 Gaussians at two places, of three sizes, in one colour that half of them have: two classes in few bytes."""
+    model = orderly()
+    i = torch.arange(4096)
+    with torch.no_grad():
+        model.means.copy_((i % 2)[:, None].expand(4096, 3))
+        model.log_scales[i % 5 == 1] += 1.5
+        model.log_scales[i % 7 == 2] -= 2
+        model.sh_rest.copy_((i % 2)[:, None, None] * torch.tensor([0.25, -0.5, 1.0]).expand(8, 3))
+    return model
+
+
 def hac_anchors(settings: Mapping[str, Any]) -> SplatModel:
     """Forty anchors of HAC with scattered values and networks, a fifth of the offsets masked."""
     values = Scattered()
@@ -294,6 +315,8 @@ def wide() -> GaussianModel:
 SMALL_VQ = {"vq.size": 4, "vq.iterations": 0}
 
 Case = tuple[str, str, dict[str, Any], Callable[[], SplatModel]]
+PRECISE = {"codec.settings.precision_power": 0.25, "codec.settings.sh_basis": True}
+
 CASES: dict[str, Case] = {
     **{f"3dgs_{rate}_v1": ("3dgs", rate, {}, lambda: procedural(48)) for rate in ("r1", "r2", "r3", "r4", "r5")},
     "3dgs_exact_v1": ("3dgs", "r6", {}, lambda: procedural(16, 2, 1)),
@@ -315,6 +338,8 @@ CASES: dict[str, Case] = {
         },
         lambda: procedural(14, 1),
     ),
+    "3dgs_precise_classes_v1": ("3dgs", "r1", {**PRECISE, "codec.position_bits": 8}, graded),
+    "3dgs_precise_packets_v1": ("3dgs", "r1", {**PRECISE, "codec.settings.prefixes": 2}, lambda: tinted(96)),
     "pruned_3dgs_v1": ("pruned-3dgs", "r3", {}, lambda: procedural(5, 1)),
     "trimming_the_fat_ply_v1": ("trimming-the-fat", "r3", {"codec": "gaussians-ply"}, lambda: procedural(5, 1)),
     "trimming_the_fat_zstd_v1": ("trimming-the-fat", "r1", {"codec": "gaussians-zstd"}, lambda: procedural(24, 1, 0)),

@@ -95,8 +95,7 @@ def test_the_default_rate_point_compresses_and_values_alone_keep_every_bit():
 def test_the_decoder_rebuilds_what_the_encoder_reconstructs(rate, n, degree, active):
     model = random_model(n, degree, active)
     sort = load_plugins().coders.load("octree").sort
-    layout, cells, symbols = lattice(model, settings_of(rate), sort)
-    expected = reconstruct(layout, cells, symbols)
+    expected = reconstruct(lattice(model, settings_of(rate), sort))
     found = decoded(encoded(model, rate))
     assert bits(found) == bits(expected)
     assert (found.max_sh_degree, found.active_sh_degree) == (degree, active)

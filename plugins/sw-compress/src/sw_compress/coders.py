@@ -5,6 +5,7 @@ A level is the step of an attribute in octaves of the step here; bits of the pos
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,15 +15,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from sw_gaussians.choices import CodecChoice
+from torch import Tensor
 
 from splatwizard_core.api import GaussianModel, create_method
 from splatwizard_core.tooling import encode as encode_model
-from sw_codecs.models import quantized
-from sw_codecs.models.band_context import activity_classes
+from sw_codecs.models import precision, quantized
 from sw_codecs.models.position_grid import PositionGrid
 from sw_codecs.models.settings import QuantizedSettings
 from sw_codecs.positions import morton
-from sw_compress.rows import like, select
+from sw_compress.rows import IMPORTANCE, like, select
 
 if TYPE_CHECKING:
     from splatwizard_core.api import PluginManager
@@ -38,6 +39,12 @@ FINEST, COARSEST = -4.0, 5.0
 LEVELS = np.arange(FINEST, COARSEST + 0.25, 0.5)
 POSITION_LEVELS = np.arange(POSITION_BITS - 20, POSITION_BITS - 7, dtype=np.float64)
 LARGEST_QUAT_STEP = 0.5
+PRECISION_POWER = 0.4
+"""Of what a Gaussian weighs in pictures by which its steps fall."""
+PRECISE_FROM = 1000
+"""Gaussians from which on they have classes of precision: a smaller file is in jumps as it is."""
+OWN_BASIS = True
+"""Whether higher SH coefficients may have a basis of the scene's own."""
 SAMPLE = 1 << 17
 """Gaussians that tables are made from."""
 TABLE_BITS = 3.0
@@ -53,12 +60,19 @@ class Quantized:
     raster      what the file asks of a renderer
     method      that the file is of: one of explicit Gaussians
     origin      of the model in the world; None: its own
+    precise     whether steps follow what Gaussians weigh
     """
 
     plugins: PluginManager
     raster: Mapping[str, Any]
     method: str = "3dgs"
     origin: tuple[float, float, float] | None = None
+    precise: bool = True
+
+    @property
+    def power(self) -> float:
+        """Of the weight of a Gaussian by which its steps fall."""
+        return PRECISION_POWER if self.precise else 0.0
 
     def attributes(self, model: GaussianModel) -> tuple[str, ...]:
         """Names of what has a level."""
@@ -73,11 +87,20 @@ class Quantized:
     def settings(self, levels: Levels) -> QuantizedSettings:
         """Settings of the codec."""
         steps = {f"{name}_step": step for name, step in self.steps(levels).items()}
-        return QuantizedSettings(position_bits=int(POSITION_BITS - levels[POSITIONS]), **steps)
+        bits = int(POSITION_BITS - levels[POSITIONS])
+        return QuantizedSettings(position_bits=bits, precision_power=self.power, sh_basis=OWN_BASIS, **steps)
 
     def steps(self, levels: Levels) -> dict[str, float]:
         """Quantiser steps by attribute, of all but the positions."""
         return {name: step * 2.0 ** levels.get(name, 0.0) for name, step in STEPS.items()}
+
+    def factors(self, model: GaussianModel) -> Tensor:
+        """Multipliers of the steps of each Gaussian [N]; 1 where nothing says what it weighs."""
+        known = getattr(model, IMPORTANCE, None)
+        if known is None or not self.power:
+            return torch.ones(model.num_rows, device=model.device)
+        classes = precision.classes_of(known.detach().cpu().double().numpy(), self.power)
+        return torch.from_numpy(precision.factors(classes)).to(model.device, torch.float32)
 
     def finest(self, model: GaussianModel) -> dict[str, float]:
         """Levels at which nothing is lost that could be seen."""
@@ -85,8 +108,8 @@ class Quantized:
 
     def rounded(self, model: GaussianModel, levels: Levels) -> GaussianModel:
         """Return the Gaussians that a file of these levels decodes to."""
-        layout, cells, symbols = quantized.lattice(model, self.settings(levels), morton.sort)
-        return like(model, quantized.reconstruct(layout, cells, symbols).to(model.device))
+        found = quantized.rounded(_unrounded(model, self.power), self.settings(levels), morton.sort)
+        return like(model, quantized.reconstruct(found).to(model.device))
 
     def sizes(self, model: GaussianModel) -> dict[str, NDArray[np.float64]]:
         """Bytes of each attribute at each of its levels, from entropies; nothing is coded."""
@@ -96,13 +119,22 @@ class Quantized:
             chosen = torch.randperm(count, generator=torch.Generator().manual_seed(0))[:SAMPLE].sort().values
             part = select(model, chosen.to(model.device))
         names = [name for name in self.attributes(model) if name != POSITIONS]
+        unrounded = quantized.unrounded(part, self.power, OWN_BASIS)
         found: dict[str, list[float]] = {name: [] for name in names}
+        order = np.zeros(0, np.int64)
+
+        def sort(cells: NDArray[np.int64]) -> NDArray[np.int64]:  # the same cells at each level
+            nonlocal order
+            order = order if len(order) else morton.sort(cells)
+            return order
+
         for level in LEVELS:
             levels = {POSITIONS: 0.0, **{name: min(level, float(self.levels(name)[-1])) for name in names}}
-            layout, _, symbols = quantized.lattice(part, self.settings(levels), morton.sort)
-            for name, bits in _bits(layout, symbols).items():
+            lattice = quantized.rounded(unrounded, self.settings(levels), sort)
+            rows = max(len(lattice.symbols), 1)
+            for name, bits in _bits(lattice).items():
                 if name in found and level <= self.levels(name)[-1]:
-                    found[name].append(bits * count / max(len(symbols), 1) / 8)
+                    found[name].append(bits * count / rows / 8)
         return {POSITIONS: self._position_sizes(model), **{name: np.array(each) for name, each in found.items()}}
 
     def _position_sizes(self, model: GaussianModel) -> NDArray[np.float64]:
@@ -127,19 +159,24 @@ class Quantized:
         return CodecChoice(name="gaussians-quantized", settings=numbers)
 
 
-def _bits(layout: quantized.Layout, symbols: NDArray[np.int32]) -> dict[str, float]:
+_last: list[tuple[weakref.ref[GaussianModel], list[float], quantized.Unrounded]] = []
+
+
+def _unrounded(model: GaussianModel, power: float) -> quantized.Unrounded:
+    """The model before it is rounded; that of the last one is kept while it is as it was."""
+    state = [power, *(getattr(model, name)._version for name in model.RAW)]
+    if not _last or _last[0][0]() is not model or _last[0][1] != state:
+        _last[:] = [(weakref.ref(model), state, quantized.unrounded(model, power, OWN_BASIS))]
+    return _last[0][2]
+
+
+def _bits(lattice: quantized.Lattice) -> dict[str, float]:
     """Bits of the columns of each attribute."""
     names = {"color": "dc", "opacity": "opacity", "scales": "scale", "quats": "quat"}
-    found = {names[key]: columns_bits(symbols[:, a:b]) for key, (a, b) in layout.sections.items()}
-    rest = 0.0
-    for band in range(1, layout.active_sh_degree + 1):
-        a, b = (layout.base_columns + 3 * (k**2 - 1) for k in (band, band + 1))
-        if band == 1:
-            rest += columns_bits(symbols[:, a:b])
-            continue
-        classes = activity_classes(symbols[:, layout.base_columns : a], layout.sh_classes)
-        rest += sum(columns_bits(symbols[classes == k, a:b]) for k in range(layout.sh_classes))
-    return {**found, "rest": rest}
+    found = dict.fromkeys(STEPS, 0.0)
+    for section, matrix in quantized.matrices(lattice):
+        found[names.get(section, "rest")] += columns_bits(matrix)
+    return found
 
 
 def columns_bits(symbols: NDArray[np.int32]) -> float:

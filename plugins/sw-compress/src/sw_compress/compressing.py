@@ -13,14 +13,14 @@ import torch
 
 from splatwizard_core.api import Camera, GaussianModel, PluginManager, RasterOptions, UserInputError, replacing
 from splatwizard_core.tooling import OUTPUT_FILE, NegotiatedRasterizer, choose_device, load_plugins, open_model
-from sw_compress.coders import Quantized
+from sw_compress.coders import PRECISE_FROM, Quantized
 from sw_compress.filling import Filled, fill
 from sw_compress.formats import FORMATS, FormatFile, format_file
 from sw_compress.measuring import Errors
 from sw_compress.pruning import Pruning
 from sw_compress.quality import PHOTOGRAPHS, Pictures, loss_against_photographs, told_loss
 from sw_compress.refining import Refined, refine
-from sw_compress.rows import with_degree
+from sw_compress.rows import IMPORTANCE, with_degree
 from sw_compress.search import Choice, Search, for_quality, measured_again
 from sw_compress.source import Source, open_source
 from sw_compress.stages import Stages, peak_bytes
@@ -174,7 +174,9 @@ class _Work:
 
 
 def _make_swz(work: _Work, path: Path) -> tuple[GaussianModel, dict[str, Any]]:
-    coder = Quantized(work.plugins, work.source.raster)
+    coder = Quantized(work.plugins, work.source.raster, precise=work.model.num_rows >= PRECISE_FROM)
+    with work.stages.timed("score"):
+        setattr(work.model, IMPORTANCE, work.pruning.importance)
     with work.stages.timed("sensitivities"):
         errors = Errors(coder, work.model, work.judge)
     search = Search(coder, work.model, work.pruning, work.judge, errors, work.gaussians)

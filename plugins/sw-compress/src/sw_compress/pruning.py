@@ -46,7 +46,14 @@ class Pruning:
         self._left = torch.arange(model.num_rows, device=model.device)
         self._gone: list[Tensor] = []
         self._costs, self._age = torch.zeros(0), ROUNDS_PER_SCORE
-        self.unseen = 0
+        self.unseen, self._importance = 0, torch.zeros(0)
+
+    @property
+    def importance(self) -> Tensor:
+        """Squared change of the pictures by that of a colour, of each Gaussian [N] while all are there."""
+        if self._age == ROUNDS_PER_SCORE and not self._gone:
+            self._score()
+        return self._importance
 
     def rows(self, count: int) -> Tensor:
         """Rows [M] int64, ascending, that are left where `count` shall be; more where the others may not go."""
@@ -85,11 +92,11 @@ class Pruning:
         with track(f"judge {len(self._left):,} Gaussians", total=len(self._cameras), unit="views") as bar:
             costs = removal_costs(
                 lambda camera: part.gaussians(camera.to(part.device), self._rasterizer),
-                _counted(self._cameras, bar), self._rasterizer, also=("blend_max",),
+                _counted(self._cameras, bar), self._rasterizer, also=("blend_max", "blend_sq"),
             )  # fmt: skip
         unseen = costs.scores["blend_max"] < SEEN
         if not self._gone:
-            self.unseen = int(unseen.sum())
+            self.unseen, self._importance = int(unseen.sum()), costs.scores["blend_sq"]
         self._costs = torch.where(unseen, torch.inf if self._keeps_unseen else -1.0, costs.change)
         self._age = 0
 

@@ -78,6 +78,7 @@ def refine(
     best, model = part, select(part, torch.arange(part.num_rows, device=part.device))
     centre = model.means.detach().median(0).values
     extent = max(float((camera.center.to(centre) - centre).norm()) for camera in cameras)
+    factors = coder.factors(model)
     draws, noise = stream(0, "refine"), torch.Generator(model.device).manual_seed(0)
     params = {name: getattr(model, name) for name in RATES if getattr(model, name).numel()}
     usual = [RATES[name] * (extent if name == "means" else 1.0) for name in params]
@@ -92,7 +93,7 @@ def refine(
             with torch.no_grad():
                 truth = rasterizer.render(source.gaussians(camera, rasterizer), camera, options).image.clamp(0, 1)
             model.train().requires_grad_(True)
-            with noisy(params, coder.steps(levels), noise):
+            with noisy(params, coder.steps(levels), noise, factors):
                 found = rasterizer.render(model.gaussians(camera, rasterizer), camera, options).image
                 optimizer.zero_grad()
                 photometric_loss(found, truth).total.backward()  # type: ignore[no-untyped-call]
@@ -117,15 +118,21 @@ def _better(
 
 
 @contextlib.contextmanager
-def noisy(params: Mapping[str, Tensor], steps: Mapping[str, float], generator: torch.Generator) -> Iterator[None]:
-    """Add uniform noise as wide as the steps to parameters for the block; gradients go to them as they are."""
+def noisy(
+    params: Mapping[str, Tensor], steps: Mapping[str, float], generator: torch.Generator, factors: Tensor
+) -> Iterator[None]:
+    """Add uniform noise as wide as the steps to parameters for the block; gradients go to them as they are.
+
+    factors     [N] of the steps of each Gaussian
+    """
     added: dict[str, Tensor] = {}
     with torch.no_grad():
         for name, attribute in NOISE.items():
             if name in params:
                 values = params[name]
                 uniform = torch.rand(values.shape, generator=generator, device=values.device)
-                added[name] = (uniform - 0.5) * steps[attribute]
+                widths = steps[attribute] * factors.reshape(-1, *[1] * (values.ndim - 1))
+                added[name] = (uniform - 0.5) * widths
                 if name == "quats":  # the file holds unit quaternions
                     added[name] *= values.norm(dim=-1, keepdim=True)
                 values.add_(added[name])

@@ -7,12 +7,19 @@ from torch import Tensor
 
 from splatwizard_core.api import GaussianModel
 
+IMPORTANCE = "importance"
+"""Attribute of a model: what each Gaussian weighs in pictures [N]; the codec `gaussians-quantized` has steps by it."""
+
 
 @torch.no_grad()
 def select(model: GaussianModel, rows: Tensor) -> GaussianModel:
     """The Gaussians of an index [M] or mask [N], in that order."""
     raw = {name: getattr(model, name).detach()[rows].contiguous() for name in model.RAW}
-    return like(model, type(model)(**raw, active_sh_degree=model.active_sh_degree))
+    part = like(model, type(model)(**raw, active_sh_degree=model.active_sh_degree))
+    known = getattr(model, IMPORTANCE, None)
+    if known is not None:
+        setattr(part, IMPORTANCE, known[rows])
+    return part
 
 
 @torch.no_grad()

@@ -24,6 +24,8 @@ SHARES = (1.0, 0.8, 0.64, 0.5, 0.4, 0.3, 0.2, 0.14, 0.1, 0.05, 0.02)
 PATIENCE = 2
 """Shares that may be worse than the best before the rest is left out."""
 QUALITY_TRIES = 16
+MEASURED = 2
+"""Choices, the smallest by their estimates, that are brought to a quality: what pruning costs is roughly estimated."""
 KEPT = 100_000
 """Gaussians up to which all parts that were looked at are kept."""
 COARSEST_PRICE = 1e300
@@ -164,12 +166,15 @@ def for_quality(search: Search, quality: float, held_out: Pictures) -> Choice:
         best = min(range(len(found)), key=lambda i: found[i].bytes)
         if len(found) - 1 - best == PATIENCE or part.num_rows > 1.02 * count or lost >= wanted:
             break
-    finest = -math.inf
+    finest, good = -math.inf, list[Choice]()
     for choice in sorted(found, key=lambda each: each.bytes):
         reached, measured = _measured(search, choice, quality, held_out)
-        if measured is not None:
-            return measured
+        good += [] if measured is None else [measured]
         finest = max(finest, reached)
+        if len(good) == MEASURED:
+            break
+    if good:
+        return min(good, key=lambda each: each.bytes)
     raise UserInputError(
         f"the finest settings reach {finest:.1f} dB against the source, which is less than {quality:g} dB"
     )

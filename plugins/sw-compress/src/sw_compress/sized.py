@@ -15,11 +15,12 @@ from sw_gaussians.surfels import refuse_surfels
 
 from splatwizard_core.api import GaussianModel, Params, RasterOptions
 from splatwizard_core.tooling import NegotiatedRasterizer, say
-from sw_compress.coders import Quantized
+from sw_compress.coders import PRECISE_FROM, Quantized
 from sw_compress.filling import fill
 from sw_compress.measuring import Errors
 from sw_compress.pruning import Pruning
 from sw_compress.quality import Pictures
+from sw_compress.rows import IMPORTANCE
 from sw_compress.search import Search
 from sw_compress.stages import Stages
 from sw_compress.views import made_up_views, training_views
@@ -64,7 +65,8 @@ class Sized:
         refuse_surfels(model, f"a size of {self.settings.size}")
         options = {key: value for key, value in raster.items() if key in ("antialias", "eps2d") and value is not None}
         rasterizer = NegotiatedRasterizer(self.plugins, device=model.device, options=options)
-        coder = Quantized(self.plugins, raster, method, None if scene is None else scene.origin)
+        origin, precise = None if scene is None else scene.origin, model.num_rows >= PRECISE_FROM
+        coder = Quantized(self.plugins, raster, method, origin, precise)
         # A copy, since the search cuts it; gradients are what the significance of a Gaussian is made of.
         part = GaussianModel(**{name: getattr(model, name).detach() for name in model.RAW},
                              active_sh_degree=model.active_sh_degree).eval()  # fmt: skip
@@ -72,8 +74,10 @@ class Sized:
         with torch.no_grad():
             seen = made_up_views(part, rasterizer, None) if scene is None else training_views(part, scene)
             judge = Pictures(part, seen.judge, rasterizer, RasterOptions(alpha=True))
-            errors = Errors(coder, part, judge)
         pruning = Pruning(part, seen.fit, rasterizer, keeps_unseen=scene is None)
+        setattr(part, IMPORTANCE, pruning.importance)
+        with torch.no_grad():
+            errors = Errors(coder, part, judge)
         search = Search(coder, part, pruning, judge, errors)
         with tempfile.TemporaryDirectory(prefix="sw-compress-") as folder:
             filled = fill(search, self._size, Path(folder) / "scene.swz", Stages(), say)

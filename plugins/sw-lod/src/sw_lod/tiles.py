@@ -9,7 +9,7 @@ the base, and what is decoded is what `gaussians-quantized` keeps at the same st
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -21,21 +21,24 @@ from splatwizard_core.api import BitstreamError, GaussianModel
 from sw_codecs.models.band_context import suitable_classes
 from sw_codecs.models.quantized import (
     FAINTEST,
+    Lattice,
     Layout,
     coverage,
     decode_rows,
     encode_rows,
     finite,
-    lattice,
     parsed,
     reconstruct,
+    rounded,
     significant_first,
+    unrounded,
 )
 from sw_codecs.positions import morton
 from sw_lod.settings import TileSettings
 
 if TYPE_CHECKING:
-    from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager
+    from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager, PositionCodec
+    from sw_codecs.models.position_grid import PositionGrid
 
 SMALLEST_PREFIX = 1 / 4
 """Of a tile, as for `significant_first`: with fewer Gaussians than that it looks worse than the base."""
@@ -56,6 +59,8 @@ class TiledLayout(Layout):
     """
 
     packets: None = None
+    precision: None = None
+    sh_basis: None = None
     base: list[Rows] = Field(max_length=MOST_TILES)
     groups: list[Group] = Field(max_length=MOST_GROUPS)
 
@@ -80,28 +85,34 @@ def encode(model: GaussianModel, writer: ContainerWriter, settings: TileSettings
     """Sections positions, color, ... of each packet as 1/positions and so on. Raises ShapeError for surfels."""
     positions = plugins.position_codecs.load(settings.positions)()
     drawn = _drawn(model)
-    layout, cells, symbols = lattice(drawn, settings, positions.sort)
-    n = layout.num_gaussians
+    found = _lattice(drawn, settings, positions)
+    n = found.layout.num_gaussians
     coarse = merged_to(drawn, math.ceil(n / settings.coarsest)) if n else drawn
-    _, base_cells, base_symbols = lattice(coarse, settings, positions.sort, layout.grid)
-    tiles = _tiles(cells, base_cells, settings.rows)
-    groups = _groups(layout, symbols, tiles, settings.layers)
+    base = _lattice(coarse, settings, positions, found.layout.grid)
+    tiles = _tiles(found.cells, base.cells, settings.rows)
+    groups = _groups(found, tiles, settings.layers)
     told = TiledLayout(
-        **layout.model_dump(exclude={"packets", "sh_classes"}),
+        **found.layout.model_dump(exclude={"packets", "precision", "sh_basis", "sh_classes"}),
         sh_classes=suitable_classes(n // max(len(groups), 1)),
         base=[tile.base for tile in tiles],
         groups=[(group.tile, len(group.rows), group.swell) for group in groups],
     )
-    writer.raster["sh_degree"] = layout.max_sh_degree
+    writer.raster["sh_degree"] = told.max_sh_degree
     writer.static.update(told.model_dump(mode="json", exclude_none=True))
     settings.state(writer)
     columns = plugins.entropy_models.load(settings.entropy)()
-    encode_rows(told, base_cells, base_symbols, "1/", writer, positions, columns)
+    encode_rows(replace(base, layout=told), "1/", writer, positions, columns)
     writer.cut()
     for number, group in enumerate(groups, 2):
-        encode_rows(told, cells[group.rows], symbols[group.rows], f"{number}/", writer, positions, columns)
+        encode_rows(replace(found, layout=told).part(group.rows), f"{number}/", writer, positions, columns)
         writer.cut()
-    writer.allow(layout.decoded_bytes, f"a model of {n:,} Gaussians")
+    writer.allow(told.decoded_bytes, f"a model of {n:,} Gaussians")
+
+
+def _lattice(
+    model: GaussianModel, settings: TileSettings, positions: PositionCodec, grid: PositionGrid | None = None
+) -> Lattice:
+    return rounded(unrounded(model, precision_power=0, own_basis=False), settings, positions.sort, grid)
 
 
 def _drawn(model: GaussianModel) -> GaussianModel:
@@ -144,20 +155,20 @@ def _tiles(cells: NDArray[np.int64], base: NDArray[np.int64], rows: int) -> list
     return [_Tile(int(a), int(b), int(c)) for a, b, c in zip(bounds, bounds[1:], held, strict=False)]
 
 
-def _groups(layout: Layout, symbols: NDArray[np.int32], tiles: list[_Tile], layers: int) -> list[_Group]:
+def _groups(found: Lattice, tiles: list[_Tile], layers: int) -> list[_Group]:
     """Groups of all tiles in the order of the file: what covers most for its size comes first."""
-    covered = coverage(layout, symbols)
-    found: list[tuple[float, int, _Group]] = []
+    covered = coverage(found)
+    ranked: list[tuple[float, int, _Group]] = []
     for number, tile in enumerate(tiles):
         worth = math.inf
-        parts, swell = significant_first(layout, symbols[tile.start : tile.end], layers, SMALLEST_PREFIX)
+        parts, swell = significant_first(found.part(slice(tile.start, tile.end)), layers, SMALLEST_PREFIX)
         for part, g in zip(parts, swell, strict=True):
             if not len(part):
                 continue
             group = _Group(number, tile.start + part, g)
             worth = min(worth, float(covered[group.rows].mean()))
-            found.append((-worth, len(found), group))
-    return [group for _, _, group in sorted(found, key=lambda each: each[:2])]
+            ranked.append((-worth, len(ranked), group))
+    return [group for _, _, group in sorted(ranked, key=lambda each: each[:2])]
 
 
 def decode(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
@@ -171,18 +182,18 @@ def decode(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
         begun[tile], swell_of[tile] = True, swell
     base = sum(layout.base)
     n = base + sum(rows for _, rows, _ in groups)
-    found = layout.model_copy(update={"num_gaussians": n})
-    reader.allow(found.decoded_bytes, f"a model of {n:,} Gaussians")
-    cells = np.empty((n, 3), dtype=np.int64)
-    symbols = np.empty((n, layout.base_columns + 3 * ((layout.active_sh_degree + 1) ** 2 - 1)), dtype=np.int32)
+    there = layout.model_copy(update={"num_gaussians": n})
+    reader.allow(there.decoded_bytes, f"a model of {n:,} Gaussians")
+    columns = layout.base_columns + layout.rest_columns
+    found = Lattice(there, np.empty((n, 3), dtype=np.int64), np.empty((n, columns), dtype=np.int32))
     end = 0
     for number, rows in enumerate([base, *(rows for _, rows, _ in groups)], 1):
         start, end = end, end + rows
-        decode_rows(layout, cells[start:end], symbols[start:end], f"{number}/", reader, plugins)
+        decode_rows(found.part(slice(start, end)), f"{number}/", reader, plugins)
     keep = np.concatenate([np.repeat(~begun, layout.base), np.ones(n - base, dtype=bool)])
     swell = np.concatenate([np.zeros(base, np.float32), *(np.full(rows, swell_of[tile]) for tile, rows, _ in groups)])
-    found = layout.model_copy(update={"num_gaussians": int(keep.sum())})
-    return finite(reconstruct(found, cells[keep], symbols[keep], swell[keep, None]), reader)
+    shown = replace(found.part(keep), layout=layout.model_copy(update={"num_gaussians": int(keep.sum())}))
+    return finite(reconstruct(shown, swell[keep, None]), reader)
 
 
 def _check(layout: TiledLayout, reader: ContainerReader) -> None:

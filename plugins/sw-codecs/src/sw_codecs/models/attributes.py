@@ -7,7 +7,6 @@ doubles in a fixed order, so that a file decodes to the same floats on every mac
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,31 +14,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatwizard_core.api import UserInputError
-from sw_codecs.models import gauge
+from sw_codecs.models import gauge, sh_basis
+from sw_codecs.models.luma import to_luma, to_rgb
+
+Array = NDArray[np.float64]
 
 SCALES_FROM = 4
 """First column of the log scales."""
 MAX_LOGIT = 20.0
 MAX_SYMBOL = 1 << 30
 
-_STEPS = (
-    ("sh_dc", "dc"),
-    ("opacity_logits", "opacity"),
-    ("log_scales", "scale"),
-    ("quats", "quat"),
-    ("sh_rest", "rest"),
-)
-"""The parts of a row of integers in order: the parameter it stands for, and its step."""
+LARGEST_QUAT_STEP = 0.5
 
-# Rows of an orthonormal transform of RGB: luma, red-blue, green-magenta. Higher SH coefficients of the three channels
-# are strongly correlated in trained scenes; orthonormal, so that one step size means one squared error in all three.
-_COLOR = np.array(
-    [
-        [1 / math.sqrt(3), 1 / math.sqrt(3), 1 / math.sqrt(3)],
-        [1 / math.sqrt(2), 0.0, -1 / math.sqrt(2)],
-        [1 / math.sqrt(6), -2 / math.sqrt(6), 1 / math.sqrt(6)],
-    ]
-)
+ROWS_AT_ONCE = 1 << 13
+
+_PARAMETERS = {
+    "dc": "sh_dc",
+    "opacity": "opacity_logits",
+    "scale": "log_scales",
+    "quat": "quats",
+    "rest": "sh_rest",
+}
+"""Parameter that a step belongs to."""
 
 
 @dataclass(frozen=True)
@@ -69,54 +65,117 @@ def base_columns(scales: int) -> int:
     return SCALES_FROM + scales + 3
 
 
-def quantize(values: Values, steps: Steps) -> NDArray[np.int32]:
-    """Integers [N, 10 + 3R] (of surfels 9 + 3R), each the nearest one. Raises UserInputError if one is beyond 2^30.
+@dataclass(frozen=True)
+class Ready:
+    """Values as they are rounded: what does not depend on steps, done once for many.
+
+    dc          in luma and chroma [N,3]
+    logits      [N,1], clipped
+    log_scales  in descending order
+    xyz         of unit quaternions [N,3]
+    rest        higher SH coefficients as they were [N,R,3]
+    factors     of the steps of each row [N]
+    basis       for the higher SH coefficients, and these in it [N,3R]; None: there is none
+    """
+
+    dc: Array
+    logits: Array
+    log_scales: Array
+    xyz: Array
+    rest: NDArray[Any]
+    factors: Array
+    basis: tuple[sh_basis.Basis, NDArray[np.float32]] | None = None
+
+
+def ready(values: Values, factors: Array | None = None, own_basis: bool = False) -> Ready:
+    """Make values ready to be rounded.
+
+    factors     [N] of the steps of each Gaussian; None: 1 each
+    own_basis   whether higher SH coefficients may get a basis of their own
+    """
+    log_scales, quats = gauge.canonical(values.log_scales, values.quats)
+    logits = np.clip(np.asarray(values.opacity_logits, np.float64), -MAX_LOGIT, MAX_LOGIT)[:, None]
+    factors = np.ones(len(logits)) if factors is None else factors
+    basis = None
+    if own_basis and values.rest.size:
+        rest = values.rest.reshape(len(logits), -1)
+        found = sh_basis.fit(_parts(rest), factors)
+        basis = found, np.concatenate([found.to(part).astype(np.float32) for part in _parts(rest)])
+    return Ready(to_luma(values.dc), logits, log_scales, quats[:, 1:], values.rest, factors, basis)
+
+
+def _parts(rows: NDArray[Any]) -> list[NDArray[Any]]:
+    """Some rows at a time: doubles of all of them would be the largest thing in memory."""
+    return [rows[start : start + ROWS_AT_ONCE] for start in range(0, max(len(rows), 1), ROWS_AT_ONCE)]
+
+
+def quantize(values: Ready, steps: Steps) -> tuple[NDArray[np.int32], NDArray[np.int8] | None]:
+    """Integers [N, 10 + 3R] (of surfels 9 + 3R), each the nearest one, and the basis of SH where it pays.
+
+    Raises UserInputError if an integer is beyond 2^30.
 
     A dead zone around zero, as in video codecs, does not pay: it shrinks the coefficients of all the Gaussians behind a
     pixel in one direction, so their errors add up (a tenth of a step cost 0.05 dB on the demo scene, and saved less
     than a coarser step that costs as much).
     """
-    log_scales, quats = gauge.canonical(values.log_scales, values.quats)
-    logits = np.clip(np.asarray(values.opacity_logits, np.float64), -MAX_LOGIT, MAX_LOGIT)
-    rest = _to_luma(values.rest).reshape(len(logits), 3 * values.rest.shape[1]) / steps.rest
-    columns = [
-        np.rint(_to_luma(values.dc) / steps.dc),
-        np.rint(logits / steps.opacity)[:, None],
-        np.rint(log_scales / steps.scale),
-        np.rint(quats[:, 1:] / steps.quat),
-        np.rint(rest),
-    ]
-    for (name, step), column in zip(_STEPS, columns, strict=True):
-        largest = np.abs(column).max(initial=0.0)
-        if not largest <= MAX_SYMBOL:
-            raise UserInputError(
-                f"a value of '{name}' is {largest * getattr(steps, step):.3g}, more than 2^30 quantiser steps: "
-                f"the model has diverged, or codec.settings.{step}_step is too small"
-            )
-    return np.concatenate(columns, axis=1).astype(np.int32)
+    count, factors = len(values.logits), values.factors
+    coded, basis = values.rest, None
+    if values.basis is not None and values.basis[0].pays(count, steps.rest):
+        coded, basis = values.basis[1], values.basis[0].matrix
+    quat_steps = _quat_steps(steps, factors)
+    symbols = np.empty((count, base_columns(values.log_scales.shape[1]) + int(np.prod(coded.shape[1:]))), np.int32)
+    for start in range(0, count, ROWS_AT_ONCE):
+        part = slice(start, start + ROWS_AT_ONCE)
+        rest = coded[part] if basis is not None else to_luma(coded[part]).reshape(len(coded[part]), -1)
+        symbols[part] = np.concatenate(
+            [
+                _rounded("dc", steps.dc * factors[part], values.dc[part]),
+                _rounded("opacity", steps.opacity * factors[part], values.logits[part]),
+                _rounded("scale", steps.scale * factors[part], values.log_scales[part]),
+                _rounded("quat", quat_steps[part], values.xyz[part]),
+                _rounded("rest", steps.rest * factors[part], rest),
+            ],
+            axis=1,
+        )
+    return symbols, basis
 
 
-def dequantize(symbols: NDArray[Any], steps: Steps, scales: int = 3) -> Values:
-    """Inverse of `quantize`, float32, for Gaussians with so many `scales`."""
+def _rounded(name: str, steps: Array, values: NDArray[Any]) -> Array:
+    """The nearest multiples [N,C] of the step of each row [N]."""
+    symbols: Array = values / steps[:, None]
+    np.rint(symbols, out=symbols)
+    if symbols.size and not -MAX_SYMBOL <= symbols.min() <= symbols.max() <= MAX_SYMBOL:
+        raise UserInputError(
+            f"a value of '{_PARAMETERS[name]}' is {np.abs(values).max():.3g}, more than 2^30 quantiser steps: "
+            f"the model has diverged, or codec.settings.{name}_step is too small"
+        )
+    return symbols
+
+
+def _quat_steps(steps: Steps, factors: Array) -> Array:
+    """Of each row [N]; a coarser one than 1/2 would leave nothing of a rotation."""
+    found: Array = np.minimum(steps.quat * factors, max(steps.quat, LARGEST_QUAT_STEP))
+    return found
+
+
+def dequantize(
+    symbols: NDArray[Any], steps: Steps, scales: int = 3, factors: Array | None = None,
+    basis: NDArray[np.int8] | None = None,
+) -> Values:  # fmt: skip
+    """Values, float32, of what `quantize` returns, for Gaussians with so many `scales`."""
     n, quats, columns = len(symbols), SCALES_FROM + scales, base_columns(scales)
     base = symbols[:, :columns].astype(np.float64)
-    rest = symbols[:, columns:].astype(np.float64).reshape(n, -1, 3)
+    factors = np.ones(n) if factors is None else factors
+    if basis is None:
+        rest = symbols[:, columns:].astype(np.float64).reshape(n, -1, 3) * (steps.rest * factors)[:, None, None]
+        rest = to_rgb(rest)
+    else:
+        sums = sh_basis.from_basis(symbols[:, columns:], basis)
+        rest = (sums * (steps.rest / sh_basis.UNIT * factors)[:, None]).reshape(n, -1, 3)
     return Values(
-        dc=_to_rgb(base[:, :3] * steps.dc).astype(np.float32),
-        rest=_to_rgb(rest * steps.rest).astype(np.float32),
-        opacity_logits=(base[:, 3] * steps.opacity).astype(np.float32),
-        log_scales=(base[:, SCALES_FROM:quats] * steps.scale).astype(np.float32),
-        quats=gauge.complete(base[:, quats:columns] * steps.quat).astype(np.float32),
+        dc=to_rgb(base[:, :3] * (steps.dc * factors)[:, None]).astype(np.float32),
+        rest=rest.astype(np.float32),
+        opacity_logits=(base[:, 3] * (steps.opacity * factors)).astype(np.float32),
+        log_scales=(base[:, SCALES_FROM:quats] * (steps.scale * factors)[:, None]).astype(np.float32),
+        quats=gauge.complete(base[:, quats:columns] * _quat_steps(steps, factors)[:, None]).astype(np.float32),
     )
-
-
-def _to_luma(rgb: NDArray[Any]) -> NDArray[np.float64]:
-    """[..., 3] red, green, blue -> luma, red-blue, green-magenta."""
-    r, g, b = np.moveaxis(np.asarray(rgb, np.float64), -1, 0)
-    return np.stack([row[0] * r + row[1] * g + row[2] * b for row in _COLOR], axis=-1)
-
-
-def _to_rgb(luma: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Inverse of `_to_luma`: the transposed matrix."""
-    y, u, v = np.moveaxis(luma, -1, 0)
-    return np.stack([column[0] * y + column[1] * u + column[2] * v for column in _COLOR.T], axis=-1)

@@ -8,6 +8,7 @@ with its own statistics. It is integer arithmetic on decoded symbols; only the n
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,21 +35,24 @@ def activity_classes(lower: NDArray[np.int32], count: int) -> NDArray[np.int64]:
     activity = np.zeros(len(lower), np.int64)
     for column in lower.T:  # one at a time: the whole matrix in 64 bits would be the largest thing in memory
         activity += np.abs(column)
-    ordered = np.sort(activity)
+    return equal_classes(activity, count)
+
+
+def equal_classes(values: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """Class 0 .. count - 1 of each of `values` [N], in classes of about equal size."""
+    ordered = np.sort(values)
     limits = ordered[[len(ordered) * i // count for i in range(1, count)]] if len(ordered) else ordered
-    return np.searchsorted(limits, activity, side="right")
+    return np.searchsorted(limits, values, side="right")
 
 
-def encode_band(columns: EntropyModel, symbols: NDArray[np.int32], classes: NDArray[np.int64], count: int) -> bytes:
+def encode_band(columns: EntropyModel, classes: Sequence[NDArray[np.int32]]) -> bytes:
     """u32 byte length of each class, then the classes; an empty class has no bytes.
 
     columns     the entropy model for integer matrices
+    classes     symbols [n,C] of the rows of each
     """
-    parts = []
-    for k in range(count):
-        rows = symbols[classes == k]
-        parts.append(columns.encode(rows, None) if len(rows) else b"")
-    return struct.pack(f"<{count}I", *map(len, parts)) + b"".join(parts)
+    parts = [columns.encode(rows, None) if len(rows) else b"" for rows in classes]
+    return struct.pack(f"<{len(parts)}I", *map(len, parts)) + b"".join(parts)
 
 
 def decode_matrix(columns: EntropyModel, data: bytes, rows: int, width: int) -> NDArray[np.int64]:

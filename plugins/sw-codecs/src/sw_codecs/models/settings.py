@@ -21,6 +21,13 @@ class LatticeSettings(Exchangeable):
 class QuantizedSettings(LatticeSettings):
     """Of the file in one piece or in packets."""
 
+    precision_power: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="power of a Gaussian's weight in pictures by which its steps fall; 0: all have the same steps",
+    )
+    sh_basis: bool = Field(False, description="SH bands 1 to 3 in a basis of the scene's own, where that is smaller")
     prefixes: int = Field(
         0,
         ge=0,

@@ -20,13 +20,18 @@ constexpr const char* BESIDE[] = {"entropy", "positions", "mode", "codec", "meth
                                   "lambda_normal", "world_origin"};
 constexpr const char* KEYS[] = {"num_gaussians", "max_sh_degree", "active_sh_degree", "position_bits", "center",
                                 "width", "top", "dc_step", "rest_step", "opacity_step", "scale_step", "quat_step",
-                                "sh_classes", "primitive", "packets"};
+                                "sh_classes", "precision", "sh_basis", "primitive", "packets"};
 
 struct Layout {
   int64_t count, degree, active, bits, classes, scales;
   double center[3], width[3], top[3];
   double dc_step, rest_step, opacity_step, scale_step, quat_step;
+  bool precision;         // rows have classes of it
+  const int8_t* basis;    // of SH bands 1 to 3; null: the usual one
 };
+
+constexpr int MOST_PRECISION = 4;
+constexpr double BASIS_UNIT = 127;
 
 constexpr int64_t MOST_PACKETS = 64;
 
@@ -62,6 +67,13 @@ double step(const Container& file, const char* key) {
   if (!(found->number > 0)) wrong(key, "Input should be greater than 0");
   if (!(found->number <= 1000)) wrong(key, "Input should be less than or equal to 1000");
   return found->number;
+}
+
+bool flag(const Container& file, const char* key) {
+  const Json* found = file.value(key);
+  if (found == nullptr || found->kind == Json::NOTHING) return false;
+  if (found->kind != Json::YES) wrong(key, "Input should be True");
+  return true;
 }
 
 void three(const Container& file, const char* key, bool integers, double* to) {
@@ -122,6 +134,8 @@ Layout layout_of(const Container& file) {
   found.scale_step = step(file, "scale_step");
   found.quat_step = step(file, "quat_step");
   found.classes = integer(file, "sh_classes", 1, 16);
+  found.precision = flag(file, "precision");
+  found.basis = nullptr;
   const Json* primitive = file.value("primitive");
   if (primitive != nullptr && primitive->kind != Json::NOTHING && !primitive->is("surfel"))
     wrong("primitive", "Input should be 'surfel'");
@@ -183,54 +197,107 @@ struct Matrix {
 const double A = 1 / __builtin_sqrt(3.0), B = 1 / __builtin_sqrt(2.0), C = 1 / __builtin_sqrt(6.0),
              D = -2 / __builtin_sqrt(6.0);
 
-// Three columns as luma, red-blue and green-magenta; row i of them goes to to[stride * row(i)]. What is activity, the sum
-// of their magnitudes, is added where it is asked for.
-template <class Row>
-void put_color(Matrix& matrix, double step, float* to, int64_t stride, const Row& row, int64_t* activity) {
-  const int64_t rows = matrix.columns.rows;
-  Buffer<int32_t> symbols[2] = {Buffer<int32_t>(rows), Buffer<int32_t>(rows)};
-  for (auto& column : symbols) {
-    const int64_t* values = matrix.next();
-    for (int64_t i = 0; i < rows; ++i) column[i] = static_cast<int32_t>(values[i]);
+// Rows of a matrix in the model, and the factors of their steps; null: all rows in order, and 1.
+struct Rows {
+  const uint32_t* numbers;
+  const double* factors;
+
+  int64_t row(int64_t i) const { return numbers == nullptr ? i : numbers[i]; }
+  double step(double step, int64_t i) const { return factors == nullptr ? step : step * factors[row(i)]; }
+};
+
+// The next two columns of three; the third is what `matrix.next()` returns afterwards.
+struct Two {
+  Buffer<int32_t> columns[2];
+
+  explicit Two(Matrix& matrix) : columns{Buffer<int32_t>(matrix.columns.rows), Buffer<int32_t>(matrix.columns.rows)} {
+    for (auto& column : columns) {
+      const int64_t* values = matrix.next();
+      for (int64_t i = 0; i < matrix.columns.rows; ++i) column[i] = static_cast<int32_t>(values[i]);
+    }
   }
-  const int64_t* last = matrix.next();
-  for (int64_t i = 0; i < rows; ++i) {
-    const double y = symbols[0][i] * step, u = symbols[1][i] * step, v = static_cast<double>(last[i]) * step;
-    float* rgb = to + stride * row(i);
-    rgb[0] = static_cast<float>(A * y + B * u + C * v);
-    rgb[1] = static_cast<float>(A * y + 0.0 * u + D * v);
-    rgb[2] = static_cast<float>(A * y + -B * u + C * v);
-    if (activity != nullptr)
-      activity[row(i)] += std::abs(int64_t{symbols[0][i]}) + std::abs(int64_t{symbols[1][i]}) + std::abs(last[i]);
+};
+
+// Where the columns of a section go: row i of a matrix to to[stride * rows.row(i)], its sum of magnitudes to activity.
+struct Target {
+  void (*put)(Matrix& matrix, const Target& target, const Rows& rows);
+  double step;
+  float* to;
+  int64_t stride;
+  int64_t* activity = nullptr;
+};
+
+// Colours, each of three columns: luma, red-blue and green-magenta.
+void put_colors(Matrix& matrix, const Target& target, const Rows& rows) {
+  for (int64_t c = 0; c < matrix.columns.width; c += 3) {
+    const Two symbols(matrix);
+    const int64_t* last = matrix.next();
+    for (int64_t i = 0; i < matrix.columns.rows; ++i) {
+      const double s = rows.step(target.step, i);
+      const double y = symbols.columns[0][i] * s, u = symbols.columns[1][i] * s, v = static_cast<double>(last[i]) * s;
+      float* rgb = target.to + target.stride * rows.row(i) + c;
+      rgb[0] = static_cast<float>(A * y + B * u + C * v);
+      rgb[1] = static_cast<float>(A * y + 0.0 * u + D * v);
+      rgb[2] = static_cast<float>(A * y + -B * u + C * v);
+      if (target.activity != nullptr)
+        target.activity[rows.row(i)] += std::abs(int64_t{symbols.columns[0][i]}) +
+                                        std::abs(int64_t{symbols.columns[1][i]}) + std::abs(last[i]);
+    }
   }
 }
 
-void put_columns(Matrix& matrix, double step, float* to) {
-  const int64_t width = matrix.columns.width;
-  for (int64_t c = 0; c < width; ++c) {
+void put_columns(Matrix& matrix, const Target& target, const Rows& rows) {
+  for (int64_t c = 0; c < matrix.columns.width; ++c) {
     const int64_t* values = matrix.next();
     for (int64_t i = 0; i < matrix.columns.rows; ++i)
-      to[width * i + c] = static_cast<float>(static_cast<double>(values[i]) * step);
+      target.to[target.stride * rows.row(i) + c] = static_cast<float>(static_cast<double>(values[i]) * rows.step(target.step, i));
   }
 }
 
-void put_quats(Matrix& matrix, double step, float* to) {
-  const int64_t rows = matrix.columns.rows;
-  Buffer<int32_t> symbols[2] = {Buffer<int32_t>(rows), Buffer<int32_t>(rows)};
-  for (auto& column : symbols) {
-    const int64_t* values = matrix.next();
-    for (int64_t i = 0; i < rows; ++i) column[i] = static_cast<int32_t>(values[i]);
-  }
+void put_quats(Matrix& matrix, const Target& target, const Rows& rows) {
+  const double coarsest = target.step > 0.5 ? target.step : 0.5;
+  const Two symbols(matrix);
   const int64_t* last = matrix.next();
-  for (int64_t i = 0; i < rows; ++i) {
-    const double x = symbols[0][i] * step, y = symbols[1][i] * step, z = static_cast<double>(last[i]) * step;
+  for (int64_t i = 0; i < matrix.columns.rows; ++i) {
+    const double own = rows.step(target.step, i), s = own < coarsest ? own : coarsest;
+    const double x = symbols.columns[0][i] * s, y = symbols.columns[1][i] * s, z = static_cast<double>(last[i]) * s;
     const double squared = x * x + y * y + z * z;
     const double w = __builtin_sqrt(1.0 - squared > 0.0 ? 1.0 - squared : 0.0);
     const double norm = __builtin_sqrt(squared > 1.0 ? squared : 1.0);
-    to[4 * i] = static_cast<float>(w / norm);
-    to[4 * i + 1] = static_cast<float>(x / norm);
-    to[4 * i + 2] = static_cast<float>(y / norm);
-    to[4 * i + 3] = static_cast<float>(z / norm);
+    float* quat = target.to + target.stride * rows.row(i);
+    quat[0] = static_cast<float>(w / norm);
+    quat[1] = static_cast<float>(x / norm);
+    quat[2] = static_cast<float>(y / norm);
+    quat[3] = static_cast<float>(z / norm);
+  }
+}
+
+// Columns of SH in a basis of their own: integers, where their values will be.
+void put_integers(Matrix& matrix, const Target& target, const Rows& rows) {
+  for (int64_t c = 0; c < matrix.columns.width; ++c) {
+    const int64_t* values = matrix.next();
+    for (int64_t i = 0; i < matrix.columns.rows; ++i) {
+      const auto value = static_cast<int32_t>(values[i]);
+      std::memcpy(target.to + target.stride * rows.row(i) + c, &value, 4);
+      target.activity[rows.row(i)] += std::abs(values[i]);
+    }
+  }
+}
+
+// The integers of each row become its coefficients. Sums are exact: a product is below 2^37.
+void from_basis(const Layout& layout, const double* factors, const Gaussians& to) {
+  const int64_t width = 3 * ((layout.active + 1) * (layout.active + 1) - 1);
+  for (int64_t i = 0; i < layout.count; ++i) {
+    float* row = to.sh_rest + 3 * to.rest * i;
+    double sums[45] = {};
+    for (int64_t j = 0; j < width; ++j) {
+      int32_t symbol;
+      std::memcpy(&symbol, row + j, 4);
+      if (symbol == 0) continue;
+      for (int64_t k = 0; k < width; ++k) sums[k] += static_cast<double>(symbol) * layout.basis[width * j + k];
+    }
+    const double step = layout.rest_step / BASIS_UNIT, s = factors == nullptr ? step : step * factors[i];
+    for (int64_t k = 0; k < width; ++k) row[k] = static_cast<float>(sums[k] * s);
   }
 }
 
@@ -250,27 +317,27 @@ Buffer<uint8_t> classes_of(const Buffer<int64_t>& activity, int64_t count) {
   return classes;
 }
 
-void put_band(Bytes data, const Layout& layout, int band, Buffer<int64_t>& activity, Gaussians& to) {
-  const int64_t count = band == 1 ? 1 : layout.classes;
-  const Buffer<uint8_t> classes = classes_of(activity, count);
+// A section whose rows are in classes by some values, each class a matrix of its own.
+void put_classes(Bytes data, const Buffer<int64_t>& values, int64_t count, int64_t width, const double* factors,
+                 const Target& target) {
+  const int64_t n = values.size;
+  const Buffer<uint8_t> classes = classes_of(values, count);
   if (data.left < 4 * count) refuse(data.left, " bytes cannot hold the lengths of ", count, " classes");
   const int64_t size = data.left;
   int64_t lengths[16], sum = 4 * count;
   for (int64_t k = 0; k < count; ++k) sum += lengths[k] = static_cast<int64_t>(data.integer(4));
   if (sum != size) refuse(grouped(size), " bytes, the class lengths say ", grouped(sum));
-  Buffer<uint32_t> rows(layout.count);
+  Buffer<uint32_t> rows(n);
   for (int64_t k = 0; k < count; ++k) {
     int64_t found = 0;
-    for (int64_t i = 0; i < layout.count; ++i)
+    for (int64_t i = 0; i < n; ++i)
       if (classes[i] == k) rows[found++] = static_cast<uint32_t>(i);
     if ((found == 0) != (lengths[k] == 0))
       refuse("class ", k, " has ", grouped(found), " rows, but ", grouped(lengths[k]), " bytes");
     const Bytes part = data.take(lengths[k]);
     if (found == 0) continue;
-    Matrix matrix(part, found, 3 * (2 * band + 1));
-    for (int coefficient = band * band - 1; coefficient < (band + 1) * (band + 1) - 1; ++coefficient)
-      put_color(matrix, layout.rest_step, to.sh_rest + 3 * coefficient, 3 * to.rest,
-                [&](int64_t i) { return static_cast<int64_t>(rows[i]); }, activity.data);
+    Matrix matrix(part, found, width);
+    target.put(matrix, target, Rows{rows.data, factors});
     matrix.finish();
   }
 }
@@ -285,13 +352,6 @@ void decode_rows(Container& file, const Layout& layout, const char* prefix, Gaus
     const Blame blame(whole.data);
     decode(data);
   };
-  const auto matrix_of = [&](const char* name, int64_t width, const auto& put) {
-    section_of(name, [&](Bytes data) {
-      Matrix matrix(data, n, width);
-      put(matrix);
-      matrix.finish();
-    });
-  };
   section_of("positions", [&](Bytes data) {
     const Points points = octree(data);
     if (points.codes.size != n) refuse("holds ", grouped(points.codes.size), " points, header says ", grouped(n));
@@ -303,17 +363,49 @@ void decode_rows(Container& file, const Layout& layout, const char* prefix, Gaus
     }
     put_means(layout, points, to.means);
   });
-  matrix_of("color", 3, [&](Matrix& matrix) {
-    put_color(matrix, layout.dc_step, to.sh_dc, 3, [](int64_t i) { return i; }, nullptr);
-  });
-  matrix_of("opacity", 1, [&](Matrix& matrix) { put_columns(matrix, layout.opacity_step, to.opacity_logits); });
-  matrix_of("scales", layout.scales, [&](Matrix& matrix) { put_columns(matrix, layout.scale_step, to.log_scales); });
-  matrix_of("quats", 3, [&](Matrix& matrix) { put_quats(matrix, layout.quat_step, to.quats); });
+  Buffer<int64_t> precision(layout.precision ? n : 0);
+  Buffer<double> factors(precision.size);
+  if (layout.precision)
+    section_of("precision", [&](Bytes data) {
+      Matrix matrix(data, n, 1);
+      const int64_t* values = matrix.next();
+      matrix.finish();
+      for (int64_t i = 0; i < n; ++i) {
+        const int64_t k = values[i];
+        if (k < -MOST_PRECISION || k > MOST_PRECISION) refuse("a class of precision is beyond ", MOST_PRECISION);
+        precision[i] = k;
+        factors[i] = power_of_two(static_cast<int>(-(k >> 1))) * (k & 1 ? 0.7071067811865476 : 1.0);
+      }
+    });
+  const double* steps = layout.precision ? factors.data : nullptr;
   Buffer<int64_t> activity(n);
   activity.clear();
-  const char* bands[] = {"sh1", "sh2", "sh3"};
-  for (int band = 1; band <= layout.active; ++band)
-    section_of(bands[band - 1], [&](Bytes data) { put_band(data, layout, band, activity, to); });
+  struct Part {
+    const char* name;
+    int64_t width;
+    Target target;
+  };
+  const auto put_sh = layout.basis != nullptr ? put_integers : put_colors;
+  const auto sh = [&](const char* name, int64_t band) {
+    return Part{name, 3 * (2 * band + 1),
+                {put_sh, layout.rest_step, to.sh_rest + 3 * (band * band - 1), 3 * to.rest, activity.data}};
+  };
+  const Part parts[] = {{"color", 3, {put_colors, layout.dc_step, to.sh_dc, 3}},
+                        {"opacity", 1, {put_columns, layout.opacity_step, to.opacity_logits, 1}},
+                        {"scales", layout.scales, {put_columns, layout.scale_step, to.log_scales, layout.scales}},
+                        {"quats", 3, {put_quats, layout.quat_step, to.quats, 4}},
+                        sh("sh1", 1), sh("sh2", 2), sh("sh3", 3)};
+  for (int i = 0; i < 4 + layout.active; ++i)
+    section_of(parts[i].name, [&](Bytes data) {
+      const Part& part = parts[i];
+      if (i > 4) return put_classes(data, activity, layout.classes, part.width, steps, part.target);
+      if (layout.precision) return put_classes(data, precision, layout.classes, part.width, steps, part.target);
+      if (i == 4) return put_classes(data, activity, 1, part.width, steps, part.target);
+      Matrix matrix(data, n, part.width);
+      part.target.put(matrix, part.target, Rows{nullptr, nullptr});
+      matrix.finish();
+    });
+  if (layout.basis != nullptr) from_basis(layout, steps, to);
 }
 
 }  // namespace
@@ -325,6 +417,14 @@ void decode_quantized(Container& file) {
   int64_t n = 0;
   for (int64_t i = 0; i < packets.count; ++i) n += packets.rows[i];
   file.allow(4 * n * (8 + layout.scales + 3 * (layout.degree + 1) * (layout.degree + 1)), n);
+  if (flag(file, "sh_basis")) {
+    const Bytes data = file.section("basis");
+    const Blame blame("basis");
+    const int64_t width = 3 * ((layout.active + 1) * (layout.active + 1) - 1);
+    if (data.left != width * width)
+      refuse(grouped(data.left), " bytes, a basis of ", width, " coefficients has ", grouped(width * width));
+    layout.basis = reinterpret_cast<const int8_t*>(data.data);
+  }
   const Gaussians whole(n, layout.degree, layout.scales);
   Gaussians part = whole;
   for (int64_t i = 0; i < packets.count; ++i) {
