@@ -127,10 +127,6 @@ class WispModel(SplatModel):
         rounds = self.phase == HARD or (self.training and self.phase not in (FLOAT, FINAL))
         return Rounding(self.phase, self.sharpness, self.sharpest) if rounds else AS_THEY_ARE
 
-    def drawn(self) -> Tensor:
-        """The 22 numbers [N,22] of all splats as they are drawn; differentiable."""
-        return self.numbers() if self.rounding is AS_THEY_ARE else self.predicted()[1]
-
     def bits(self) -> Tensor:
         """Bits [N,22] of the numbers of all splats as this phase rounds them; differentiable."""
         forecast, drawn = self.predicted()
@@ -212,8 +208,7 @@ class WispModel(SplatModel):
 
     def shown(self, draws: Draws) -> Shown:
         """Return what a rasterizer draws, and the bits of a splat, in tensors whose sizes no value decides."""
-        values, bits = self.drawn_and_bits(draws)
-        return self._shown(values, draws.places, bits)
+        return self._shown(*self.drawn_and_bits(draws), draws.places)
 
     def prefix_of(
         self, packets: Sequence[tuple[int, str]], forecast: Forecast, drawn: Tensor, swell: Tensor | None = None
@@ -230,9 +225,9 @@ class WispModel(SplatModel):
         if swell is not None:
             values = swelled(values, swell[self.subsets])
         places = torch.rand_like(self.means) if self.jitters and self.training else None
-        return replace(self._inputs(self._shown(values, places, None)), visible=known.there)
+        return replace(self._inputs(self._shown(values, None, places)), visible=known.there)
 
-    def _shown(self, values: Tensor, places: Tensor | None, bits: Tensor | None) -> Shown:
+    def _shown(self, values: Tensor, bits: Tensor | None, places: Tensor | None) -> Shown:
         edges = self.log_edges(self.levels)
         means = None if places is None else self.means + (places - 0.5) * edges.exp()[:, None]
         make = fast_drawable if fit_kernels(values, edges) else drawable
@@ -260,7 +255,8 @@ class WispModel(SplatModel):
     @torch.no_grad()
     def as_gaussians(self) -> GaussianModel:
         """The plain Gaussians that are drawn in eval mode, with all SH bands."""
-        return plain_gaussians(self.means, self.drawn(), self.log_edges(self.levels), self.cube, self.network)
+        drawn = self.numbers() if self.rounding is AS_THEY_ARE else self.predicted()[1]
+        return plain_gaussians(self.means, drawn, self.log_edges(self.levels), self.cube, self.network)
 
     @torch.no_grad()
     def coded(self) -> Scene:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import torch
@@ -18,35 +18,34 @@ from torch.autograd.function import once_differentiable
 
 from splatwizard_native import fast_enabled
 from sw_wisp.fast.native import WISP
-from sw_wisp.rate_model import PyramidRate
 from sw_wisp.rounding import SOFT
 from sw_wisp.splats import Draws, Shown
 
-if TYPE_CHECKING:
-    from sw_wisp.model import WispModel
-
 log = logging.getLogger(__name__)
+
+Model = Any
+"""A `WispModel`, which imports this."""
 
 READ_ANEW = ("sharpness", "split_seed")
 """Numbers of the model that change no operator of a step."""
 
 
-def fits(model: WispModel) -> bool:
+def fits(model: Model) -> bool:
     """Whether splats of a model are taken from graphs: in training on a GPU, if kernels compute its networks."""
     if not (fast_enabled() and model.training and torch.is_grad_enabled() and model.opacity.requires_grad):
         return False
-    on_gpu = model.device.type == "cuda" and WISP.has_cuda()
-    return isinstance(model.rate, PyramidRate) and (model in STEPS or on_gpu)
+    has_networks = next(model.rate.children(), None) is not None  # others take the sharpness as it is
+    return has_networks and (model in STEPS or (model.device.type == "cuda" and WISP.has_cuda()))
 
 
-def shown(model: WispModel) -> Shown | None:
+def shown(model: Model) -> Shown | None:
     """As `model.shown` of new draws; None where no graph can be made."""
     if model not in STEPS:
         STEPS[model] = FixedSplats()
     return STEPS[model](model)
 
 
-def release(model: WispModel) -> None:
+def release(model: Model) -> None:
     """Free a model's graphs and their GPU memory."""
     STEPS.pop(model, None)
 
@@ -66,7 +65,7 @@ class FixedSplats:
         self._step: FixedStep | None = None
         self._draws = Draws()
 
-    def __call__(self, model: WispModel) -> Shown | None:
+    def __call__(self, model: Model) -> Shown | None:
         """Return the splats of the next step; differentiable. None where no graph can be made, which is said once."""
         if self._failed:
             return None
@@ -81,7 +80,7 @@ class FixedSplats:
         means = None if draws.places is None else found[4]
         return Shown(*found[:4], means, None if draws.sample is None else found[-1])
 
-    def _draw_anew(self, model: WispModel) -> Draws:
+    def _draw_anew(self, model: Model) -> Draws:
         """Draw as `model.draws`, where the tensors stand."""
         sample, noise, places, soft = self._draws
         if sample is not None:
@@ -96,7 +95,7 @@ class FixedSplats:
                 place.fill_(value)
         return self._draws
 
-    def _prepare(self, model: WispModel, key: tuple[Any, ...]) -> None:
+    def _prepare(self, model: Model, key: tuple[Any, ...]) -> None:
         if self._step is not None and self._graphs:
             torch.cuda.synchronize()
         self._step = None
@@ -144,5 +143,5 @@ class _Replayed(torch.autograd.Function):
         return None, None, None
 
 
-STEPS: WeakKeyDictionary[WispModel, FixedSplats] = WeakKeyDictionary()
+STEPS: WeakKeyDictionary[Model, FixedSplats] = WeakKeyDictionary()
 """Graphs of the models that train."""
