@@ -2,6 +2,7 @@
 
     python benchmarks/train_wisp.py --sizes 60000@800x800 --device cuda
     python benchmarks/train_wisp.py --sizes 60000@800x800 --device cuda --ways graphs --kernels 25
+    python benchmarks/train_wisp.py --sizes 60000@800x800 --device cuda --ways graphs --tasks
     python benchmarks/train_wisp.py --sizes 8000@128x96 --steps 30 --device cpu --operators
 
 Trains the synthetic scene of benchmarks/scene.py, drawn by itself with other colours, by the stage of wisp with its
@@ -10,13 +11,15 @@ Nothing is removed, so that all steps have the same splats. Steps a second are t
 first one warms up; the mean loss of these steps stands beside, which must be alike whatever the way. 3DGS, drawing as
 many, comes last. --kernels lists those that take the GPU longest, those of graphs included. --operators counts what
 torch is asked to do in a step, views and empty tensors left out: on a GPU each is at least one launch. Kernels of our
-own are not among them, but on CUDA the profiler counts all launches.
+own are not among them, but on CUDA the profiler counts all launches. --tasks trains the whole plan in its place, scaled
+to 180 steps, and tells what its tasks take (removal, levels, fits, measurements) and would in 18,000 steps.
 """
 
 from __future__ import annotations
 
 import argparse
 import collections
+import dataclasses
 import os
 import sys
 import time
@@ -42,6 +45,8 @@ from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.scene.images import keep_pictures
 from splatwizard_core.streams import Streams
 from splatwizard_core.training.params import PipelineParams
+from splatwizard_core.training.plan import Registration
+from splatwizard_core.training.scheduler import build_schedulers
 from splatwizard_core.training.stage import StageContext
 from splatwizard_core.training.state import TrainingState
 from splatwizard_core.training.trainer import Trainer
@@ -100,10 +105,8 @@ class Operators(TorchDispatchMode):
 
 def trainer_of(n: int, width: int, height: int, steps: int, device: str, kind: str) -> Trainer:
     """A training of wisp of three phases of `steps` steps each, behind the first."""
-    model, scene, _ = scene_of(n, width, height, device)
-    keep_pictures(scene.train, device)
     bounds = {"noise": 1, "levels": [], "cells": 2, "place": 10**6, "soft": steps + 1, "hard": 2 * steps + 1}
-    config = WispConfig.model_validate(
+    return begun(
         {
             "iterations": 18_000,
             "budget": {"cap": n, "cap_factor": 1.0, "worthless": 0.0},
@@ -112,8 +115,15 @@ def trainer_of(n: int, width: int, height: int, steps: int, device: str, kind: s
             "context": {"kind": kind, "fit": 2, "rebuild": 10**6},
             "positions": {"rule": "mid"},
             "phases": {**bounds, "freeze": 10**6},
-        }
-    )
+        }, n, width, height, device,
+    )  # fmt: skip
+
+
+def begun(values: dict[str, Any], n: int, width: int, height: int, device: str) -> Trainer:
+    """A training of wisp with these values of its configuration."""
+    config = WispConfig.model_validate(values)
+    model, scene, _ = scene_of(n, width, height, device)
+    keep_pictures(scene.train, device)
     stage, rasterizer, streams = WispStage(config), NegotiatedRasterizer(load_plugins(), device=device), Streams(0)
     ppl = PipelineParams(device=device)
     model = stage.begin(StageContext(model, scene, ppl, rasterizer, streams, lambda name: model))
@@ -156,10 +166,45 @@ def launches(trainer: Trainer, steps: int, most: int) -> tuple[float, float, lis
     return len(kernels) / steps, busy, longest_kernels(found, steps, most)
 
 
+def tasks(n: int, width: int, height: int, args: argparse.Namespace) -> None:
+    """Seconds of each task of the plan."""
+    config = {"iterations": 180, "scale_schedule": True, "budget": {"cap": n, "cap_factor": 1.0, "worthless": 0.0}}
+    trainer = begun(config, n, width, height, args.device)
+    spent: dict[str, list[float]] = collections.defaultdict(list)
+    for scheduler in (trainer.state.pre, trainer.state.post):
+        scheduler.registrations[:] = [timed(entry, spent, args.device) for entry in scheduler.registrations]
+    since = wait(args.device)
+    trainer.run(180, lambda state: None)
+    print(f"  {wait(args.device) - since:.1f} s for 180 steps, {trainer.state.num_rows:,} splats left")
+    plans = build_schedulers(WispStage(WispConfig()), PipelineParams())
+    for entry in (entry for plan in plans for entry in plan.registrations):
+        times, of = len(entry.fires_in(0, 18_000)), spent[entry.name]
+        if of:
+            mean = sum(of) / len(of)
+            print(f"  {entry.name:34} {1e3 * mean:9.2f} ms, {times:6,} times: {mean * times:7.2f} s")
+
+
+def timed(entry: Registration, spent: dict[str, list[float]], device: str) -> Registration:
+    """The same registration; what it takes goes into `spent`."""
+
+    def binding(context: Any) -> Any:
+        since = wait(device)
+        try:
+            return entry.binding(context)
+        finally:
+            spent[entry.name].append(wait(device) - since)
+
+    return dataclasses.replace(entry, binding=binding)
+
+
 def measure(n: int, width: int, height: int, args: argparse.Namespace) -> None:
     watched = min(10, args.steps // 4)
     print(f"{n:,} splats, {width}x{height}, {args.device}")
     for way in args.ways:
+        if args.tasks:
+            with seeded(0), made(way):
+                tasks(n, width, height, args)
+            continue
         with seeded(0), made(way):
             trainer = trainer_of(n, width, height, args.steps, args.device, args.context)
             for phase in PHASES:
@@ -197,6 +242,7 @@ def main() -> None:
         "--ways", default=",".join(WAYS), type=lambda text: text.split(","), help="(default: %(default)s)"
     )
     parser.add_argument("--kernels", type=int, default=0, help="how many of the longest kernels are listed")
+    parser.add_argument("--tasks", action="store_true", help="time the tasks of the plan")
     parser.add_argument("--operators", action="store_true", help="count operators by part")
     parser.add_argument("--device", default="cuda", choices=["cuda", "cpu"])
     args = parser.parse_args()
