@@ -134,8 +134,8 @@ class WispModel(SplatModel):
 
     def drawn_and_bits(self, draws: Draws) -> tuple[Tensor, Tensor | None]:
         """Numbers [N,22] of all splats as drawn, and bits of a splat, in the mean of a sample; differentiable."""
-        numbers, sample = self.numbers(), draws.sample
-        first = 0 if self.rounding is AS_THEY_ARE else len(numbers)
+        numbers, sample, known = self.numbers(), draws.sample, draws.known
+        first = 0 if self.rounding is AS_THEY_ARE and known is None else len(numbers)
         if not first and sample is None:
             return numbers, None
 
@@ -147,7 +147,7 @@ class WispModel(SplatModel):
         rounding = replace(self.rounding, drawn_noise=draws.noise, soft=draws.soft)
         forecast, drawn = self.rate.predict(context, behind(numbers), rounding)
         if sample is None:
-            return drawn, None
+            return drawn if known is None else as_known(drawn, forecast, known.of(self.subsets)), None
         bits = bits_of(drawn, forecast, len(sample)).sum() / len(sample)
         return drawn[:first] if first else numbers, bits
 
@@ -178,11 +178,7 @@ class WispModel(SplatModel):
 
     def _take(self, rows: Mapping[str, Tensor]) -> None:
         for name, values in rows.items():
-            held = getattr(self, name)
-            if held.shape == values.shape:  # a step that is replayed reads them where they stand
-                held.copy_(values)
-            else:
-                setattr(self, name, values)
+            getattr(self, name).copy_(values)  # a step that is replayed reads them where they stand
 
     @torch.no_grad()
     def place_bits(self) -> Tensor:
@@ -193,8 +189,6 @@ class WispModel(SplatModel):
 
     def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
         """All splats, whatever the camera; in training `extras["bits"]` are those of one, in the mean of a sample."""
-        if self.training and self.packets is not None:
-            return self.prefix_of(self.layers.order[: self.packets], *self.predicted())
         shown = replay.shown(self) if replay.fits(self) else None
         return self._inputs(self.shown(self.draws()) if shown is None else shown)
 
@@ -204,11 +198,15 @@ class WispModel(SplatModel):
         count = max(1, math.ceil(self.counted * n)) if self.training and self.counted else 0
         sample = torch.randint(n, (count,), device=self.device) if count else None
         noise = self.rounding.noise(self.means.new_empty(n + count, NUMBERS))
-        return Draws(sample, noise, torch.rand_like(self.means) if self.jitters and self.training else None)
+        places = torch.rand_like(self.means) if self.jitters and self.training else None
+        if not self.training or self.packets is None:
+            return Draws(sample, noise, places)
+        return Draws(sample, noise, places, Known.after(self.layers.order[: self.packets], self.layers, self.device))
 
     def shown(self, draws: Draws) -> Shown:
         """Return what a rasterizer draws, and the bits of a splat, in tensors whose sizes no value decides."""
-        return self._shown(*self.drawn_and_bits(draws), draws.places)
+        visible = None if draws.known is None else draws.known.there[self.subsets]
+        return self._shown(*self.drawn_and_bits(draws), draws.places)._replace(visible=visible)
 
     def prefix_of(
         self, packets: Sequence[tuple[int, str]], forecast: Forecast, drawn: Tensor, swell: Tensor | None = None
@@ -224,8 +222,7 @@ class WispModel(SplatModel):
         values = as_known(drawn, forecast, known)
         if swell is not None:
             values = swelled(values, swell[self.subsets])
-        places = torch.rand_like(self.means) if self.jitters and self.training else None
-        return replace(self._inputs(self._shown(values, None, places)), visible=known.there)
+        return self._inputs(self._shown(values, None, None)._replace(visible=known.there))
 
     def _shown(self, values: Tensor, bits: Tensor | None, places: Tensor | None) -> Shown:
         edges = self.log_edges(self.levels)
@@ -235,12 +232,10 @@ class WispModel(SplatModel):
 
     def _inputs(self, shown: Shown) -> GaussianInputs:
         return GaussianInputs(
-            means=self.means if shown.means is None else shown.means,
-            opacities=shown.opacities,
-            cov3d=shown.covariances,
-            sh=SH(dc=shown.dc, rest=shown.rest, active_degree=self.network.degree),
-            extras={} if shown.bits is None else {"bits": shown.bits},
-        )
+            means=self.means if shown.means is None else shown.means, opacities=shown.opacities,
+            cov3d=shown.covariances, sh=SH(dc=shown.dc, rest=shown.rest, active_degree=self.network.degree),
+            extras={} if shown.bits is None else {"bits": shown.bits}, visible=shown.visible,
+        )  # fmt: skip
 
     @torch.no_grad()
     def tidied(self) -> dict[str, Tensor]:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from sw_wisp.appearance import AppearanceNetwork, sh_dc_of
+from sw_wisp.layers import Known
 from sw_wisp.numbers import GROUPS
 from sw_wisp.shape import covariance
 
@@ -18,12 +19,14 @@ class Draws(NamedTuple):
     sample      [S] int64 splats whose bits are counted
     noise       [N+S,22] in place of rounding, of all splats and of the sample
     places      [N,3] of U(0,1), within cells
+    known       what packets that are drawn alone tell
     soft        see `Rounding`
     """
 
     sample: Tensor | None = None
     noise: Tensor | None = None
     places: Tensor | None = None
+    known: Known | None = None
     soft: Tensor | None = None
 
 
@@ -33,6 +36,7 @@ class Shown(NamedTuple):
     opacities [N]; covariances [N,6], see `shape.covariance`; dc [N,1,3], SH band 0; rest [N,K,3], the bands above it
     means       [N,3]; None: those of the model
     bits        of a splat; None: they are not counted
+    visible     [N] bool; None: all are
     """
 
     opacities: Tensor
@@ -41,6 +45,7 @@ class Shown(NamedTuple):
     rest: Tensor
     means: Tensor | None = None
     bits: Tensor | None = None
+    visible: Tensor | None = None
 
 
 def drawable(values: Tensor, log_edges: Tensor, bounds: tuple[float, float], network: AppearanceNetwork) -> Shown:

@@ -9,6 +9,7 @@ from wisp_scenes import made_up
 from sw_wisp.appearance import AppearanceNetwork
 from sw_wisp.fast import replay
 from sw_wisp.fast.replay import FixedSplats
+from sw_wisp.layers import Layers
 from sw_wisp.model import WispModel
 from sw_wisp.numbers import GROUPS
 from sw_wisp.rate_model import PyramidRate, StaticRate
@@ -19,7 +20,8 @@ SWITCHES = [
     {"phase": FLOAT}, {"phase": NOISE}, {"phase": NOISE, "counted": 0.3},
     {"phase": NOISE, "counted": 0.3, "jitters": True}, {"phase": SOFT, "sharpness": 2.5, "counted": 0.3},
     {"phase": SOFT, "sharpness": 7.0}, {"phase": HARD, "counted": 0.1}, {"phase": FLOAT, "counted": 0.3},
-    {"phase": FINAL},
+    {"phase": FINAL}, {"phase": HARD, "packets": 2}, {"phase": SOFT, "sharpness": 3.0, "packets": 1},
+    {"phase": FINAL, "packets": 4},
 ]  # fmt: skip
 """Attributes of the model at steps of a training."""
 
@@ -36,6 +38,8 @@ def made(device="cpu", rate=PyramidRate):
         cube=scene.cube, network=network, rate=rate,
     )  # fmt: skip
     model.size.data.add_(model.log_edges(model.levels))
+    model.subsets = torch.arange(N) % 2
+    model.layers = Layers.of_subsets(2, 1)
     model.begin_rate()
     with torch.no_grad():
         for parameter in (*rate.parameters(), network.out.weight):
@@ -52,18 +56,19 @@ def replayed(model, graphs=False):
 
 def step(model, **switches):
     """What a step draws, and its gradients."""
-    for name, value in {"counted": 0.0, "jitters": False, **switches}.items():
+    for name, value in {"counted": 0.0, "jitters": False, "packets": None, **switches}.items():
         setattr(model, name, value)
     torch.manual_seed(3)
     model.zero_grad()
     found = model.gaussians(None, None)
     results = [found.means, found.opacities, found.cov3d, found.sh.dc, found.sh.rest, *found.extras.values()]
+    there = [] if found.visible is None else [found.visible.float()]
     loss = sum(
         (each * torch.linspace(0.5, 1, each.numel(), device=each.device).view_as(each)).sum() for each in results
     )
     loss.backward()
     grads = {name: p.grad.clone() for name, p in model.named_parameters() if p.grad is not None}
-    return [each.detach().clone() for each in results], grads
+    return [each.detach().clone() for each in (*results, *there)], grads
 
 
 @pytest.mark.parametrize("rounds", [False, True])
@@ -108,10 +113,11 @@ def check_what_is_made_anew(device, graphs):
     assert captures(phase=SOFT) == 5
     model.cube = type(model.cube)(model.cube.low, model.cube.edge * 2)
     assert captures(phase=SOFT) == 6
+    assert [captures(phase=SOFT, packets=n) for n in (1, 3, None, 2)] == [7, 7, 7, 7]  # both are held
     model.eval().gaussians(None, None)
     with torch.no_grad():
         model.train().gaussians(None, None)
-    assert (fixed.captures, fixed._failed) == (6, False)
+    assert (fixed.captures, fixed._failed) == (7, False)
 
 
 def test_a_step_is_prepared_once_and_anew_when_a_switch_or_a_tensor_changes():

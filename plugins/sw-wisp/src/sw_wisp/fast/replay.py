@@ -18,6 +18,7 @@ from torch.autograd.function import once_differentiable
 
 from splatwizard_native import fast_enabled
 from sw_wisp.fast.native import WISP
+from sw_wisp.layers import Known
 from sw_wisp.rounding import SOFT
 from sw_wisp.splats import Draws, Shown
 
@@ -26,8 +27,8 @@ log = logging.getLogger(__name__)
 Model = Any
 """A `WispModel`, which imports this."""
 
-READ_ANEW = ("sharpness", "split_seed")
-"""Numbers of the model that change no operator of a step."""
+READ_ANEW = ("sharpness", "split_seed", "counted", "packets")
+"""Numbers of the model that change no operator of a step, or decide which of its graphs is replayed."""
 
 
 def fits(model: Model) -> bool:
@@ -62,77 +63,96 @@ class FixedSplats:
         self._graphs, self._failed = graphs, False
         self._key: tuple[Any, ...] = ()
         self._watched = Watched([])
-        self._step: FixedStep | None = None
-        self._draws = Draws()
+        self._steps: dict[tuple[bool, float], tuple[FixedStep, Draws]] = {}
+        self._pool: tuple[int, int] | None = None
 
     def __call__(self, model: Model) -> Shown | None:
         """Return the splats of the next step; differentiable. None where no graph can be made, which is said once."""
-        if self._failed:
+        prepared = None if self._failed else self._prepared(model)
+        if prepared is None:
             return None
+        (step, draws), learning = prepared, self._watched.learning
+        _draw_anew(model, draws)
+        results: list[Tensor] = []
+        found = list(_Replayed.apply(step, learning, results, learning[0]))  # type: ignore[no-untyped-call]
+        bits = None if draws.sample is None else found.pop()
+        return Shown(*found[:4], found[4] if draws.places is not None else None, bits, *results)
+
+    def _prepared(self, model: Model) -> tuple[FixedStep, Draws] | None:
         parts = (model.network, model.rate, *model.rate.children())
         key = (model.cube, plain_values(model, READ_ANEW), *(plain_values(part) for part in parts))
-        if self._step is None or key != self._key or not self._watched.unchanged():
-            self._prepare(model, key)
-        if self._step is None:
-            return None
-        draws, learning = self._draw_anew(model), self._watched.learning
-        found = list(_Replayed.apply(self._step, learning, learning[0]))  # type: ignore[no-untyped-call]
-        means = None if draws.places is None else found[4]
-        return Shown(*found[:4], means, None if draws.sample is None else found[-1])
+        if key != self._key or not self._watched.unchanged():
+            self._drop()
+            self._key, self._watched = key, Watched.of(model)
+        which = model.packets is None, model.counted
+        if which not in self._steps:
+            try:
+                self._steps[which] = self._prepare(model)
+            except RuntimeError as error:
+                self._failed = True
+                log.warning("training goes on without CUDA graphs, slower: %s", str(error).partition("\n")[0])
+            if self._failed:  # beyond the handler, whose error holds what was made until then
+                self._drop()
+                torch.cuda.empty_cache()
+        return self._steps.get(which)
 
-    def _draw_anew(self, model: Model) -> Draws:
-        """Draw as `model.draws`, where the tensors stand."""
-        sample, noise, places, soft = self._draws
-        if sample is not None:
-            sample.random_(0, model.num_rows)
-        if noise is not None:
-            model.rounding.draw(noise)
-        if places is not None:
-            places.uniform_()
-        if soft is not None:
-            sharpness = model.rounding.sharpness
-            for place, value in zip(soft, (sharpness, 0.5 / math.tanh(0.5 * sharpness)), strict=True):
-                place.fill_(value)
-        return self._draws
-
-    def _prepare(self, model: Model, key: tuple[Any, ...]) -> None:
-        if self._step is not None and self._graphs:
-            torch.cuda.synchronize()
-        self._step = None
-        self._key, self._watched = key, Watched.of(model)
+    def _prepare(self, model: Model) -> tuple[FixedStep, Draws]:
         with torch.random.fork_rng([model.device] if model.device.type == "cuda" else []):  # steps draw, not captures
-            self._draws = draws = model.draws()
+            draws = model.draws()
         if model.rounding.phase == SOFT:
-            self._draws = draws = draws._replace(soft=torch.ones(2, device=model.device))
+            draws = draws._replace(soft=torch.ones(2, device=model.device))
 
         def compute() -> Found:
-            return tuple(each for each in model.shown(draws) if each is not None), ()
+            *results, visible = model.shown(draws)
+            return tuple(each for each in results if each is not None), () if visible is None else (visible,)
 
         self.captures += 1
         if not self._graphs:
-            self._step = PlainStep(compute, self._watched.learning)
-            return
-        try:
-            with torch.cuda.device(model.device):
-                pool = torch.cuda.graph_pool_handle()
-                self._step = CapturedStep(compute, self._watched.learning, pool)
-        except RuntimeError as error:
-            self._failed = True
-            log.warning("training goes on without CUDA graphs, slower: %s", str(error).partition("\n")[0])
-        if self._failed:  # beyond the handler, whose error holds what was made until then
-            self._watched, self._draws = Watched([]), Draws()
-            del compute, draws
-            torch.cuda.empty_cache()
+            return PlainStep(compute, self._watched.learning), draws
+        with torch.cuda.device(model.device):
+            self._pool = self._pool or torch.cuda.graph_pool_handle()
+            return CapturedStep(compute, self._watched.learning, self._pool), draws
+
+    def _drop(self) -> None:
+        """Drop all graphs. Waits for the device, which may be running one."""
+        if self._steps and self._graphs:
+            torch.cuda.synchronize()
+        self._steps, self._pool, self._watched = {}, None, Watched([])
+
+
+@torch.no_grad()
+def _draw_anew(model: Model, draws: Draws) -> None:
+    """Draw as `model.draws` does, where the tensors stand."""
+    if draws.sample is not None:
+        draws.sample.random_(0, model.num_rows)
+    if draws.noise is not None:
+        model.rounding.draw(draws.noise)
+    if draws.places is not None:
+        draws.places.uniform_()
+    if draws.known is not None:
+        told = Known.after(model.layers.order[: model.packets], model.layers, torch.device("cpu"))
+        for mine, each in zip(draws.known, told, strict=True):
+            mine.copy_(each, non_blocking=True)
+    if draws.soft is not None:
+        sharpness = model.rounding.sharpness
+        for place, value in zip(draws.soft, (sharpness, 0.5 / math.tanh(0.5 * sharpness)), strict=True):
+            place.fill_(value)
 
 
 class _Replayed(torch.autograd.Function):
-    """Results of a FixedStep, whose gradients go to `learning`; `leaf` is one of these, for the graph."""
+    """Results of a FixedStep, whose gradients go to `learning`; `leaf` is one of these, for the graph.
+
+    others  gets its results without gradients
+    """
 
     @staticmethod
-    def forward(ctx: Any, step: FixedStep, learning: list[Tensor], leaf: Tensor) -> tuple[Tensor, ...]:
+    def forward(
+        ctx: Any, step: FixedStep, learning: list[Tensor], others: list[Tensor], leaf: Tensor
+    ) -> tuple[Tensor, ...]:
         ctx.step, ctx.learning = step, learning
         ctx.set_materialize_grads(False)
-        results, _ = step.forward()
+        results, constants = step.forward()
+        others.extend(constants)
         # What is logged must still be there after the next step.
         return tuple(each.detach() if each.dim() else each.detach().clone() for each in results)
 
@@ -140,7 +160,7 @@ class _Replayed(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *slopes: Tensor | None) -> tuple[Tensor | None, ...]:
         add_gradients(ctx.learning, ctx.step.backward(slopes))
-        return None, None, None
+        return None, None, None, None
 
 
 STEPS: WeakKeyDictionary[Model, FixedSplats] = WeakKeyDictionary()
