@@ -114,9 +114,10 @@ class WispStage(Stage):
         found = converted(model, views, context.rasterizer, background, self.config, context.generator("method"))
         found.split_seed = context.generator("split").initial_seed()
         self.tidy(found)
-        self.set_levels(found, views, context.rasterizer, background, "begin")
-        if self.config.appearance.steps == "sensitivity":
-            self.set_latent_steps(found, views, context.rasterizer, background)
+        with still(found):  # a step that is replayed leaves its gradients at the parameters, for the optimizer
+            self.set_levels(found, views, context.rasterizer, background, "begin")
+            if self.config.appearance.steps == "sensitivity":
+                self.set_latent_steps(found, views, context.rasterizer, background)
         found.begin_rate()
         return found
 

@@ -4,12 +4,17 @@ from contextlib import nullcontext
 
 import pytest
 import torch
+from sw_gaussians.fast.graphs import PlainStep
+from sw_kit import short_training
 from wisp_scenes import made_up
 
+from splatwizard_core.runs.config import apply_overrides
 from sw_wisp.appearance import AppearanceNetwork
+from sw_wisp.config import WispConfig
 from sw_wisp.fast import replay
 from sw_wisp.fast.replay import FixedSplats
 from sw_wisp.layers import Layers
+from sw_wisp.method import Wisp
 from sw_wisp.model import WispModel
 from sw_wisp.numbers import GROUPS
 from sw_wisp.rate_model import PyramidRate, StaticRate
@@ -160,6 +165,26 @@ def test_a_gpu_that_refuses_graphs_is_named_once_and_training_goes_on(monkeypatc
         torch.testing.assert_close(step(model, **switches), step(plain, **switches), rtol=0, atol=0)
     assert caplog.messages == ["training goes on without CUDA graphs, slower: no room"]
     assert fixed.captures == 1
+
+
+def test_the_first_steps_of_a_training_are_the_plain_ones(plugins, toy, rasterizer, monkeypatch):
+    values = {"iterations": 3, "context.fit": 0, "appearance.steps": "sensitivity"}
+    method = Wisp(plugins, apply_overrides(WispConfig(), values, source="test").completed(plugins, {}))
+
+    def trained():
+        return short_training.train(
+            method, toy.scene, rasterizer, model=lambda: None, trained={"3dgs": toy.truth}.__getitem__
+        )
+
+    plain, steps = trained(), []
+    monkeypatch.setattr(replay, "fits", lambda model: model.training)
+    monkeypatch.setattr(torch.cuda, "graph_pool_handle", lambda: (0, 0))
+    monkeypatch.setattr(torch.cuda, "device", lambda _: nullcontext())
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda: None)
+    monkeypatch.setattr(replay, "CapturedStep", lambda *given: steps.append(PlainStep(*given[:2])) or steps[-1])
+    found = trained()
+    assert (found.losses, found.model.digest()) == (plain.losses, plain.model.digest())
+    assert len(steps) == 1  # none for what is measured before the first step, whose gradients would stay
 
 
 @pytest.mark.cuda

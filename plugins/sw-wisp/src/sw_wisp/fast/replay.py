@@ -142,6 +142,8 @@ def _draw_anew(model: Model, draws: Draws) -> None:
 class _Replayed(torch.autograd.Function):
     """Results of a FixedStep, whose gradients go to `learning`; `leaf` is one of these, for the graph.
 
+    They go there whoever asks, `torch.autograd.grad` too: what is measured between steps takes a model in eval mode.
+
     others  gets its results without gradients
     """
 
