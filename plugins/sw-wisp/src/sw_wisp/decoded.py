@@ -56,11 +56,11 @@ class Decoded:
         """The 22 numbers [N,22] float32 in their own units."""
         every = np.arange(len(self))
         units = self.state.units(every, slice(None)).astype(np.float64)
-        pulled = self.strengths[self.state.planes][:, GROUP_OF_COLUMN] / 255.0  # [N,22]
-        pulled[:, OPACITY.columns] = self.strengths[0, 0] / 255.0  # opacity and latents are never coarse
-        pulled[:, REFINED.stop :] = self.strengths[0, -1] / 255.0
-        pulled[~self.state.has_view, REFINED.stop :] = 0
-        if pulled.any():
+        if self.strengths.any():
+            pulled = self.strengths[self.state.planes][:, GROUP_OF_COLUMN] / 255.0  # [N,22]
+            pulled[:, OPACITY.columns] = self.strengths[0, 0] / 255.0  # opacity and latents are never coarse
+            pulled[:, REFINED.stop :] = self.strengths[0, -1] / 255.0
+            pulled[~self.state.has_view, REFINED.stop :] = 0
             widths = np.ones(units.shape, np.int64)
             widths[:, REFINED] = 3 ** self.state.planes.astype(np.int64)[:, None]
             units += pulled * self.state.multiplier * to_centroid(self.state.index, self.state.scale, widths)

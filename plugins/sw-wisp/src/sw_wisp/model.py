@@ -14,11 +14,12 @@ from splatwizard_core.api import SH, GaussianInputs, GaussianModel, SplatModel
 from sw_codecs.positions import morton
 from sw_wisp.appearance import AppearanceNetwork
 from sw_wisp.cube import Cube
+from sw_wisp.fast import replay
 from sw_wisp.fast.kernels import fit_kernels
 from sw_wisp.fast.splats import drawable as fast_drawable
 from sw_wisp.file import Scene
 from sw_wisp.layers import Known, Layers, as_known, swelled
-from sw_wisp.numbers import GROUPS, SIZE
+from sw_wisp.numbers import GROUPS, NUMBERS, SIZE
 from sw_wisp.octree import Cells, position_bits
 from sw_wisp.plain import bounds_in, plain_gaussians
 from sw_wisp.pyramid import FEATURES
@@ -26,7 +27,7 @@ from sw_wisp.rate import Forecast
 from sw_wisp.rate_model import Placed, PyramidRate, StaticRate, bits_of
 from sw_wisp.rounding import AS_THEY_ARE, FINAL, FLOAT, HARD, Rounding
 from sw_wisp.shape import bounded
-from sw_wisp.splats import drawable
+from sw_wisp.splats import Draws, Shown, drawable
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Camera, Rasterizer
@@ -126,27 +127,29 @@ class WispModel(SplatModel):
         rounds = self.phase == HARD or (self.training and self.phase not in (FLOAT, FINAL))
         return Rounding(self.phase, self.sharpness, self.sharpest) if rounds else AS_THEY_ARE
 
-    def drawn(self) -> Tensor:
-        """The 22 numbers [N,22] of all splats as they are drawn; differentiable."""
-        return self.numbers() if self.rounding is AS_THEY_ARE else self.predicted()[1]
-
     def bits(self) -> Tensor:
         """Bits [N,22] of the numbers of all splats as this phase rounds them; differentiable."""
         forecast, drawn = self.predicted()
         return bits_of(drawn, forecast)
 
-    def drawn_and_bits(self, sample: Tensor) -> tuple[Tensor, Tensor]:
-        """Numbers [N,22] of all splats as drawn, and bits [S,22] of some under noise of their own; differentiable."""
-        numbers = self.numbers()
-        first = 0 if self.rounding is AS_THEY_ARE else len(numbers)
+    def drawn_and_bits(self, draws: Draws) -> tuple[Tensor, Tensor | None]:
+        """Numbers [N,22] of all splats as drawn, and bits of a splat, in the mean of a sample; differentiable."""
+        numbers, sample, known = self.numbers(), draws.sample, draws.known
+        first = 0 if self.rounding is AS_THEY_ARE and known is None else len(numbers)
+        if not first and sample is None:
+            return numbers, None
 
         def behind(rows: Tensor) -> Tensor:
-            return torch.cat([rows[:first], rows.index_select(0, sample)])
+            return rows if sample is None else torch.cat([rows[:first], rows.index_select(0, sample)])
 
-        # The sample stands behind all splats, so that networks run once.
+        # The sample stands behind all splats, under noise of its own, so that networks run once.
         context = tuple(behind(each) for each in self._context)
-        forecast, drawn = self.rate.predict(context, behind(numbers), self.rounding)
-        return drawn[:first] if first else numbers, bits_of(drawn, forecast, len(sample))
+        rounding = replace(self.rounding, drawn_noise=draws.noise, soft=draws.soft)
+        forecast, drawn = self.rate.predict(context, behind(numbers), rounding)
+        if sample is None:
+            return drawn if known is None else as_known(drawn, forecast, known.of(self.subsets)), None
+        bits = bits_of(drawn, forecast, len(sample)).sum() / len(sample)
+        return drawn[:first] if first else numbers, bits
 
     def begin_rate(self) -> None:
         """Start the rate model anew from the splats."""
@@ -175,7 +178,7 @@ class WispModel(SplatModel):
 
     def _take(self, rows: Mapping[str, Tensor]) -> None:
         for name, values in rows.items():
-            setattr(self, name, values)
+            getattr(self, name).copy_(values)  # a step that is replayed reads them where they stand
 
     @torch.no_grad()
     def place_bits(self) -> Tensor:
@@ -185,17 +188,25 @@ class WispModel(SplatModel):
         return torch.from_numpy(position_bits(Cells(levels.cpu().numpy(), codes))).to(self.device)
 
     def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
-        """All splats, whatever the camera; in training `extras["bits"]` [S,22] are those of the splats that count."""
-        extras = {}
-        if self.training and self.packets is not None:
-            return self.prefix_of(self.layers.order[: self.packets], *self.predicted())
-        if self.training and self.counted:
-            n = self.num_rows
-            sample = torch.randint(n, (max(1, math.ceil(self.counted * n)),), device=self.device)
-            values, extras["bits"] = self.drawn_and_bits(sample)
-        else:
-            values = self.drawn()
-        return self._inputs(values, extras)
+        """All splats, whatever the camera; in training `extras["bits"]` are those of one, in the mean of a sample."""
+        shown = replay.shown(self) if replay.fits(self) else None
+        return self._inputs(self.shown(self.draws()) if shown is None else shown)
+
+    def draws(self) -> Draws:
+        """Draw what a step needs."""
+        n = self.num_rows
+        count = max(1, math.ceil(self.counted * n)) if self.training and self.counted else 0
+        sample = torch.randint(n, (count,), device=self.device) if count else None
+        noise = self.rounding.noise(self.means.new_empty(n + count, NUMBERS))
+        places = torch.rand_like(self.means) if self.jitters and self.training else None
+        if not self.training or self.packets is None:
+            return Draws(sample, noise, places)
+        return Draws(sample, noise, places, Known.after(self.layers.order[: self.packets], self.layers, self.device))
+
+    def shown(self, draws: Draws) -> Shown:
+        """Return what a rasterizer draws, and the bits of a splat, in tensors whose sizes no value decides."""
+        visible = None if draws.known is None else draws.known.there[self.subsets]
+        return self._shown(*self.drawn_and_bits(draws), draws.places)._replace(visible=visible)
 
     def prefix_of(
         self, packets: Sequence[tuple[int, str]], forecast: Forecast, drawn: Tensor, swell: Tensor | None = None
@@ -211,21 +222,20 @@ class WispModel(SplatModel):
         values = as_known(drawn, forecast, known)
         if swell is not None:
             values = swelled(values, swell[self.subsets])
-        return replace(self._inputs(values, {}), visible=known.there)
+        return self._inputs(self._shown(values, None, None)._replace(visible=known.there))
 
-    def _inputs(self, values: Tensor, extras: dict[str, Tensor]) -> GaussianInputs:
-        means, edges = self.means, self.log_edges(self.levels)
-        if self.jitters and self.training:
-            means = means + (torch.rand_like(means) - 0.5) * edges.exp()[:, None]
+    def _shown(self, values: Tensor, bits: Tensor | None, places: Tensor | None) -> Shown:
+        edges = self.log_edges(self.levels)
+        means = None if places is None else self.means + (places - 0.5) * edges.exp()[:, None]
         make = fast_drawable if fit_kernels(values, edges) else drawable
-        opacities, covariances, dc, rest = make(values, edges, self.bounds, self.network)
+        return make(values, edges, self.bounds, self.network)._replace(means=means, bits=bits)
+
+    def _inputs(self, shown: Shown) -> GaussianInputs:
         return GaussianInputs(
-            means=means,
-            opacities=opacities,
-            cov3d=covariances,
-            sh=SH(dc=dc, rest=rest, active_degree=self.network.degree),
-            extras=extras,
-        )
+            means=self.means if shown.means is None else shown.means, opacities=shown.opacities,
+            cov3d=shown.covariances, sh=SH(dc=shown.dc, rest=shown.rest, active_degree=self.network.degree),
+            extras={} if shown.bits is None else {"bits": shown.bits}, visible=shown.visible,
+        )  # fmt: skip
 
     @torch.no_grad()
     def tidied(self) -> dict[str, Tensor]:
@@ -240,7 +250,8 @@ class WispModel(SplatModel):
     @torch.no_grad()
     def as_gaussians(self) -> GaussianModel:
         """The plain Gaussians that are drawn in eval mode, with all SH bands."""
-        return plain_gaussians(self.means, self.drawn(), self.log_edges(self.levels), self.cube, self.network)
+        drawn = self.numbers() if self.rounding is AS_THEY_ARE else self.predicted()[1]
+        return plain_gaussians(self.means, drawn, self.log_edges(self.levels), self.cube, self.network)
 
     @torch.no_grad()
     def coded(self) -> Scene:

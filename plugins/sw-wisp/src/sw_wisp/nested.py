@@ -69,7 +69,7 @@ class Stream(ABC):
         given = None if wanted is None else np.asarray(wanted, np.int64).reshape(-1)
         if given is not None and np.abs(given).max(initial=0) >= INDEX_LIMIT:
             raise ValueError(f"an index of {np.abs(given).max():,} is beyond {INDEX_LIMIT:,} steps")
-        radius = exact_tables().gaussian.radius[flat].astype(np.int64)
+        radius = exact_tables().gaussian.radius[flat]
         entry = None if given is None else np.where(np.abs(given) > radius, 2 * radius + 1, given + radius)
         entry = self.entries(flat, entry)
         found, outside = entry - radius, entry > 2 * radius

@@ -27,21 +27,29 @@ class Rounding:
 
     phase           one of this module's
     sharpness       of soft rounding, 1..most; noise fades as it rises
+    drawn_noise     what `noise` returns; None: it draws
+    soft            [2] sharpness s and 1 / (2 tanh(s/2)), which kernels read as they run: a step may be replayed
     """
 
     phase: str
     sharpness: float = 1.0
     most: float = 8.0
+    drawn_noise: Tensor | None = None
+    soft: Tensor | None = None
 
     def noise(self, values: Tensor) -> Tensor | None:
         """Draw what `drawn` needs for values of this shape: numbers of U(-1/2, 1/2), fewer and fewer; None: nothing.
 
         From torch's own generator, which a checkpoint holds.
         """
-        if self.phase not in (NOISE, SOFT):
-            return None
+        if self.drawn_noise is not None or self.phase not in (NOISE, SOFT):
+            return self.drawn_noise
+        return self.draw(torch.empty_like(values, requires_grad=False))
+
+    def draw(self, noise: Tensor) -> Tensor:
+        """Draw into `noise` and return it."""
         width = 1.0 if self.phase == NOISE else max(0.0, 1 - (self.sharpness - 1) / (self.most - 1))
-        return torch.empty_like(values, requires_grad=False).uniform_(-width / 2, width / 2)
+        return noise.uniform_(-width / 2, width / 2)
 
     def drawn(self, values: Tensor, mean: Tensor, steps: Tensor, noise: Tensor | None) -> Tensor:
         """Return values [N,C] as they are drawn; differentiable, as far as rounding is.

@@ -35,6 +35,7 @@ from splatwizard_core.api import (
 from sw_wisp.config import WispConfig
 from sw_wisp.conversion import converted
 from sw_wisp.cube import Cube
+from sw_wisp.fast.replay import release
 from sw_wisp.file import Choice, encode, nearest
 from sw_wisp.layers import Layers, split
 from sw_wisp.model import WispModel
@@ -113,9 +114,10 @@ class WispStage(Stage):
         found = converted(model, views, context.rasterizer, background, self.config, context.generator("method"))
         found.split_seed = context.generator("split").initial_seed()
         self.tidy(found)
-        self.set_levels(found, views, context.rasterizer, background, "begin")
-        if self.config.appearance.steps == "sensitivity":
-            self.set_latent_steps(found, views, context.rasterizer, background)
+        with still(found):  # a step that is replayed leaves its gradients at the parameters, for the optimizer
+            self.set_levels(found, views, context.rasterizer, background, "begin")
+            if self.config.appearance.steps == "sensitivity":
+                self.set_latent_steps(found, views, context.rasterizer, background)
         found.begin_rate()
         return found
 
@@ -247,14 +249,7 @@ class WispStage(Stage):
             self.set_levels(model, cameras, rasterizer, scene.background.to(model.device), str(step))
         self.measure(model)
 
-    def place(
-        self,
-        model: WispModel,
-        cameras: CameraIterator,
-        rasterizer: Rasterizer,
-        scene: Scene,
-        step: int,
-    ) -> None:
+    def place(self, model: WispModel, cameras: CameraIterator, rasterizer: Rasterizer, scene: Scene, step: int) -> None:
         """Put every splat at the centre of its cell for good."""
         self.tidy(model)
         model.cube = Cube.around(model.means)
@@ -269,14 +264,9 @@ class WispStage(Stage):
         self.fit(model, cameras, rasterizer, scene.background.to(model.device), "place")
 
     def freeze(
-        self,
-        model: WispModel,
-        optimizer: SplatOptimizer,
-        cameras: CameraIterator,
-        rasterizer: Rasterizer,
-        scene: Scene,
-        log: TaskLog,
-    ) -> None:
+        self, model: WispModel, optimizer: SplatOptimizer, cameras: CameraIterator, rasterizer: Rasterizer,
+        scene: Scene, log: TaskLog,
+    ) -> None:  # fmt: skip
         """Fix all integers as an encoder does; splats take the order of the file, which decides at equal depths."""
         self.measure(model)
         choice: Choice = nearest
@@ -295,15 +285,9 @@ class WispStage(Stage):
         log.say(f"{model.num_rows:,} splats; bits of each: {told}")
 
     def prune(
-        self,
-        model: WispModel,
-        optimizer: SplatOptimizer,
-        cameras: CameraIterator,
-        rasterizer: Rasterizer,
-        scene: Scene,
-        step: int,
-        log: TaskLog,
-    ) -> None:
+        self, model: WispModel, optimizer: SplatOptimizer, cameras: CameraIterator, rasterizer: Rasterizer,
+        scene: Scene, step: int, log: TaskLog,
+    ) -> None:  # fmt: skip
         """Remove what costs more bits than it is worth, and copy others in place of some."""
         if step >= self.iterations:
             return
@@ -431,8 +415,7 @@ class WispStage(Stage):
         if model.packets is not None:
             total = total * config.layers.weight
         if "bits" in result.extras:
-            counted = result.extras["bits"]
-            bits = counted.sum() / len(counted)
+            bits = result.extras["bits"]
             parts["bits"] = bits.detach()  # of a splat's 22 numbers
             total = total + self.price(step) * model.num_rows * bits
         return LossPack(total, parts)
@@ -441,6 +424,7 @@ class WispStage(Stage):
         """Measure what each prefix of the file shows, if it has layers."""
         assert isinstance(model, WispModel)
         model.packets = None
+        release(model)
         if model.layers.order:
             background = scene.background.to(model.device)
             draws, updates = stream(model.split_seed, "swell"), self.config.layers.swell

@@ -17,6 +17,7 @@ from splatwizard_core.api import BitstreamError
 from sw_codecs.bits.packing import ByteReader
 from sw_codecs.entropy.exact_tables import exact_tables
 from sw_wisp.eight_bits import EXACT_EXPONENT, HIGHEST_EXPONENT, LARGEST_WEIGHT, EightBitLayer
+from sw_wisp.fast.ties import moved as fast_moved
 from sw_wisp.nested import UNIT, table_levels
 from sw_wisp.numbers import BLOCKS, PARTS
 from sw_wisp.packets import VALUE_LIMIT, State, even
@@ -44,6 +45,9 @@ def moved(tie: EightBitLayer, before: slice, rows: np.ndarray, state: State) -> 
     before  columns in its block that are known
     """
     at = even(rows)
+    found = fast_moved(tie, before, at, (state.index, state.scale, state.multiplier), sizes_of_a_step())
+    if found is not None:
+        return found
     index = state.index[at, before].astype(np.int64)
     residuals = np.clip(index * state.multiplier[at, before], -VALUE_LIMIT, VALUE_LIMIT)
     tables = table_levels(state.scale[at, before])

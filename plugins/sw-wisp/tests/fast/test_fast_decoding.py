@@ -13,11 +13,12 @@ from splatwizard_core.api import BitstreamError, ContainerReader, ContainerWrite
 from sw_codecs.exact_native import EXACT as CODECS
 from sw_codecs.fast import exact_face as codecs_face
 from sw_wisp import file, nested, octree
-from sw_wisp.fast import exact_face, running_means, streams
+from sw_wisp.fast import exact_face, running_means, streams, ties
 from sw_wisp.fast.exact_native import EXACT
 from sw_wisp.fast.running_means import pyramid_of
 from sw_wisp.fast.streams import FastReader
 from sw_wisp.nested import Reader, Writer
+from sw_wisp.numbers import PARTS
 from sw_wisp.octree_contexts import Shares
 from sw_wisp.pyramid import BASE, REFINED, VIEW
 
@@ -39,7 +40,7 @@ def plain(monkeypatch):
 
     def call(work):
         with monkeypatch.context() as patch:
-            for module in (streams, running_means):
+            for module in (streams, running_means, ties):
                 patch.setattr(module, "EXACT", SimpleNamespace(try_load=lambda: False))
             return work()
 
@@ -160,6 +161,20 @@ def test_running_means_and_features_are_the_same_integers(plain):
     assert torch.equal(walk(), plain(walk))
 
 
+@pytest.mark.parametrize("rows", [slice(1, 800, 3), slice(0, 800), slice(5, 6)])
+def test_ties_add_the_same_integers(plain, rows):
+    rng, context = np.random.default_rng(4), some_networks().exact()
+    index, scale = rng.integers(-(1 << 21), 1 << 21, (800, 22)), rng.integers(0, 63 * 4096 + 1, (800, 22))
+    index[::2] //= 1 << 16
+    parts = {"index": index, "scale": scale, "multiplier": rng.integers(64, 8192, (800, 22))}
+    state, at = SimpleNamespace(**{name: part.astype(np.int32) for name, part in parts.items()}), np.arange(800)[rows]
+    for part in (PARTS[1][1], *PARTS[2][1:], *PARTS[3][1:]):
+        ours, theirs = context.moved(part, at, state), plain(lambda p=part: context.moved(p, at, state))
+        for one, other in zip(ours, theirs, strict=True):
+            assert np.array_equal(one, other)
+            assert one.any()
+
+
 def test_senseless_calls_are_refused():
     shape = {
         "cells": 1,
@@ -171,6 +186,12 @@ def test_senseless_calls_are_refused():
     for changed in ({"rows": torch.tensor([3])}, {"leaf": leaf + 1}, {"first": 3}):
         with pytest.raises(RuntimeError, match=r"row|cell|columns"):
             exact_face.pyramid_add(**{"rows": rows, "leaf": leaf, "parent": parent, "first": 0} | shape | changed)
+    splats = torch.zeros(3, 22, dtype=torch.int32)
+    shape = {"index": splats, "scale": splats, "multiplier": splats, "sizes": torch.zeros(64, dtype=torch.int64)}
+    shape |= {"weights": torch.zeros(2, 1, 4, dtype=torch.int64), "moved": torch.zeros(2, 2, 1, dtype=torch.int64)}
+    for changed in ({"first": 2}, {"first": -1}, {"step": 0}, {"start": 19}):
+        with pytest.raises(RuntimeError, match=r"row|columns"):
+            exact_face.moved(**{"first": 0, "step": 1, "start": 0} | shape | changed)
     words = torch.zeros(8, dtype=torch.uint8)
     for state, zeros in (([0, -1, 0, 3], 5), ([0, 1, 0, 2], 5), ([0, -1, 0, 2], 0)):
         with pytest.raises(RuntimeError, match=r"words|range|zeros"):

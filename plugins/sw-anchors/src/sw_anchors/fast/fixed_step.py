@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import torch
+from sw_gaussians.fast.graphs import Found
 from torch import Tensor, nn
 
 from splatwizard_core.api import Camera, GaussianInputs
-from sw_anchors.fast.graphs import Found
 from sw_anchors.fast.networks import network_outputs
 from sw_anchors.fast.rows import load_rows, noisy_rows, take_rows
 from sw_anchors.fast.seen_rows import SeenRows

@@ -15,6 +15,7 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 import torch
+from sw_gaussians.fast.graphs import CapturedStep, FixedStep, PlainStep, Watched, add_gradients, plain_values
 from sw_gaussians.morton import interleave
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
@@ -29,7 +30,6 @@ from sw_anchors.fast.fixed_step import (
     inputs_of,
     sample_capacity,
 )
-from sw_anchors.fast.graphs import CapturedStep, FixedStep, PlainStep, Watched, add_gradients
 from sw_anchors.fast.rows import add_rows, put_rows
 from sw_anchors.fast.seen_rows import ExpectedRows, SeenRows, capacity_of
 from sw_anchors.native import ANCHORS
@@ -177,7 +177,7 @@ class FixedDecoder:
         rate_model = model.rate_model if model.phase == ENTROPY else None
         parts_of_it = [] if rate_model is None else [rate_model, *vars(rate_model).values()]
         deciding = [model, *(each for each in parts_of_it if each is rate_model or isinstance(each, nn.Module))]
-        key = (*(_plain_values(each) for each in deciding), *(part.shape[1:] for part in parts))
+        key = (*(plain_values(each) for each in deciding), *(part.shape[1:] for part in parts))
         room = capacity <= self._rows_held("positions") and places <= self._rows_held("pool counted")
         if key != self._key or not self._watched.unchanged() or not room:
             self._drop()
@@ -249,18 +249,6 @@ class FixedDecoder:
 
 
 DECODERS: WeakKeyDictionary[Any, FixedDecoder] = WeakKeyDictionary()
-
-
-def _plain_values(holder: object) -> list[Any]:
-    """Return an object's numbers and strings, which decide the operators that run."""
-    return [(name, value) for name, value in vars(holder).items() if _is_plain(value)]
-
-
-def _is_plain(value: Any) -> bool:
-    return type(value) in _PLAIN or (type(value) is tuple and all(type(each) in _PLAIN for each in value))
-
-
-_PLAIN = (bool, int, float, str)
 
 
 class _Decoded(torch.autograd.Function):

@@ -9,7 +9,7 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 import torch
-from sw_anchors.fast.graphs import CapturedStep, FixedStep, Found, PlainStep, Watched, add_gradients
+from sw_gaussians.fast.graphs import CapturedStep, FixedStep, Found, PlainStep, Watched, add_gradients
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 

@@ -1,4 +1,4 @@
-"""Operations of `exact_kernels/face.h`."""
+"""Operations of `exact_kernels/ties_face.h`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Types of exact_kernels/face.h, written by tools/make_faces.py."""
+"""Types of exact_kernels/ties_face.h, written by tools/make_faces.py."""
 
 from ctypes import Array, Structure
 from typing import Any
@@ -39,4 +39,20 @@ def pyramid_add(
     width: int | None = None,
     own: Tensor | Array[Any] | int,
     sums: Tensor | Array[Any] | int,
+) -> Structure: ...
+def moved(
+    *,
+    index: Tensor | Array[Any] | int,
+    scale: Tensor | Array[Any] | int,
+    multiplier: Tensor | Array[Any] | int,
+    splats: int | None = None,
+    first: int,
+    step: int,
+    start: int,
+    weights: Tensor | Array[Any] | int,
+    sizes: Tensor | Array[Any] | int,
+    n: int | None = None,
+    columns: int | None = None,
+    before: int | None = None,
+    moved: Tensor | Array[Any] | int,
 ) -> Structure: ...

@@ -58,10 +58,8 @@ def predicted(
     layers = [layer for network in networks.networks for layer in (network[0], network[-1])]  # type: ignore[index]
     parameters = [layer.weight for layer in layers] + list(networks.ties) + [layer.bias for layer in layers]
     how = rounding, networks.adaptive, moves_steps, networks.rounds
-    tables = networks.base_steps, networks.multipliers
-    found = _Predicted.apply(  # type: ignore[no-untyped-call]
-        values, rounding.noise(values), features, view_features, *tables, how, *parameters
-    )
+    given = rounding.noise(values), rounding.soft, features, view_features, networks.base_steps, networks.multipliers
+    found = _Predicted.apply(values, *given, how, *parameters)  # type: ignore[no-untyped-call]
     mean, scale, steps, drawn = found
     return Forecast(mean, scale, steps), drawn
 
@@ -76,8 +74,8 @@ def bits_of(values: Tensor, forecast: Forecast, last: int | None = None) -> Tens
 class _Predicted(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, values: Tensor, noise: Tensor | None, features: Tensor, view_features: Tensor, base_steps: Tensor,
-        multipliers: Tensor, how: tuple[Rounding, bool, bool, bool], *parameters: Tensor,
+        ctx: Any, values: Tensor, noise: Tensor | None, soft: Tensor | None, features: Tensor, view_features: Tensor,
+        base_steps: Tensor, multipliers: Tensor, how: tuple[Rounding, bool, bool, bool], *parameters: Tensor,
     ) -> tuple[Tensor, ...]:  # fmt: skip
         rounding, adaptive, moves_steps, rounds = how
         kernels, rows = kernels_of(values), len(values)
@@ -93,7 +91,7 @@ class _Predicted(torch.autograd.Function):
         columns = _hidden_columns([len(each) for each in weights[::2]])
         hidden, outputs = values.new_empty(rows, columns[-1].stop), values.new_empty(rows, ALL_OUTPUTS)
         told = values.new_empty(rows, TOLD[-1].stop)
-        phase = {"phase": PHASES[rounding.phase], "sharpness": rounding.sharpness, "adaptive": adaptive}
+        phase = {"phase": PHASES[rounding.phase], "sharpness": rounding.sharpness, "soft": soft, "adaptive": adaptive}
         for number, block in enumerate(BLOCKS):
             seen = (view_inputs if number == 3 else inputs)[:, : FEATURES + block.start]
             inner, outer = hidden[:, columns[number]], outputs[:, OUTPUTS[number]]
@@ -128,8 +126,8 @@ class _Predicted(torch.autograd.Function):
             base_steps=base_steps, mean=mean, steps=steps, by_mean=slopes[0], by_scale=slopes[1], by_steps=slopes[2],
             by_drawn=slopes[3], to_outputs=to_outputs, to_values=to_values,
         )  # fmt: skip
-        others: list[Tensor | None] = [None] * 6
-        if not any(ctx.needs_input_grad[7:]):
+        others: list[Tensor | None] = [None] * 7
+        if not any(ctx.needs_input_grad[8:]):
             return (to_values, *others, *[None] * 21)
         to_hidden = torch.empty_like(hidden)
         for number, last in enumerate(lasts):

@@ -12,17 +12,16 @@ from sw_wisp.appearance import AppearanceNetwork
 from sw_wisp.fast.eight_bits import in_eight_bits
 from sw_wisp.fast.kernels import kernels_of
 from sw_wisp.numbers import COLOUR, LATENTS
-from sw_wisp.splats import Drawable
+from sw_wisp.splats import Shown
 
 SEEN = slice(COLOUR.columns.start, LATENTS.columns.stop)
 """Columns of what the appearance network sees, colour first; its own weights have the latents first."""
 
 
-def drawable(values: Tensor, log_edges: Tensor, bounds: tuple[float, float], network: AppearanceNetwork) -> Drawable:
+def drawable(values: Tensor, log_edges: Tensor, bounds: tuple[float, float], network: AppearanceNetwork) -> Shown:
     """As `splats.drawable`, where the kernels fit."""
     parameters = network.basis, network.hidden.weight, network.out.weight, network.hidden.bias, network.out.bias
-    found: Drawable = _Drawable.apply(values, log_edges, bounds, network.rounds, *parameters)  # type: ignore[no-untyped-call]
-    return found
+    return Shown(*_Drawable.apply(values, log_edges, bounds, network.rounds, *parameters))  # type: ignore[no-untyped-call]
 
 
 class _Drawable(torch.autograd.Function):

@@ -49,7 +49,7 @@ class FastReader(Stream):
 
     def entries(self, tables: np.ndarray, wanted: np.ndarray | None) -> np.ndarray:
         number = torch.from_numpy(tables.astype(np.int16) * FRACTIONS + CENTRED)
-        return self._get(len(tables), lambda: self._coder.entries(share_tables("gaussian"), number)).astype(np.int64)
+        return self._get(len(tables), lambda: self._coder.entries(share_tables("gaussian"), number))
 
     def choices(self, counts: np.ndarray, wanted: np.ndarray | None) -> np.ndarray:
         return self._get(len(counts), lambda: self._coder.choices(torch.from_numpy(counts))).astype(np.int64)

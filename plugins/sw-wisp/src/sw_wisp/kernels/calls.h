@@ -6,11 +6,13 @@
 
 namespace sw_wisp {
 
-inline Plan plan_of(int32_t phase, double sharpness, bool adaptive, bool moves_steps, const float* noise) {
+template <class Call>
+Plan plan_of(const Call& call, bool moves_steps) {
+  const int32_t phase = call.phase;
   if (phase < kAsTheyAre || phase > kHard) splatwizard::refuse("there is no phase %d", int(phase));
-  if ((phase == kNoise || phase == kSoft) && noise == nullptr) splatwizard::refuse("phase %d needs noise", int(phase));
-  const double half = phase == kSoft ? 0.5 / std::tanh(0.5 * sharpness) : 0.;
-  return {phase, float(sharpness), float(half), adaptive, moves_steps};
+  if ((phase == kNoise || phase == kSoft) && call.noise == nullptr) splatwizard::refuse("phase %d needs noise", int(phase));
+  const double half = phase == kSoft ? 0.5 / std::tanh(0.5 * call.sharpness) : 0.;
+  return {phase, float(call.sharpness), float(half), call.soft, call.adaptive, moves_steps};
 }
 
 inline Matrices of_call(const eight_bits_call& call) {
@@ -26,7 +28,7 @@ inline Matrices of_call(const eight_bits_call& call) {
 inline Draw of_call(const draw_call& call) {
   if (call.block < 0 || call.block >= kBlocks) splatwizard::refuse("there is no block %d", int(call.block));
   Draw found{};
-  found.block = call.block, found.plan = plan_of(call.phase, call.sharpness, call.adaptive, true, call.noise);
+  found.block = call.block, found.plan = plan_of(call, true);
   found.rows = call.rows, found.values = call.values, found.noise = call.noise, found.outputs = call.outputs;
   found.inputs = call.inputs, found.view_inputs = call.view_inputs;
   found.base_steps = call.base_steps, found.multipliers = call.multipliers;
@@ -37,7 +39,7 @@ inline Draw of_call(const draw_call& call) {
 }
 
 inline DrawBack of_call(const draw_backward_call& call) {
-  return {plan_of(call.phase, call.sharpness, call.adaptive, call.moves_steps, call.noise),
+  return {plan_of(call, call.moves_steps),
           call.rows,    call.values,   call.noise,    call.mean,     call.steps,      call.outputs, call.base_steps,
           call.by_mean, call.by_scale, call.by_steps, call.by_drawn, call.to_outputs, call.to_values};
 }

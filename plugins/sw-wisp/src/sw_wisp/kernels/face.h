@@ -22,6 +22,7 @@ typedef struct {
   int32_t block;             // 0..3: opacity; shape and size; colour; latents
   int32_t phase;             // 0: values as they are, 1: noise, 2: soft rounding, 3: rounding
   double sharpness;
+  const float* soft;         // [2] or null: sharpness s and 1 / (2 tanh(s / 2)), read when this runs instead
   bool adaptive;             // whether steps follow the networks
   const float* values;       // [rows, 22]
   const float* noise;        // [rows, 22] or null
@@ -45,6 +46,7 @@ typedef struct {
   sw_head head;
   int32_t phase;
   double sharpness;
+  const float* soft;         // [2] or null
   bool adaptive;
   bool moves_steps;          // whether steps have a gradient
   const float* values;       // [rows, 22]

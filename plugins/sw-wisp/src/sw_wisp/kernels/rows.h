@@ -48,12 +48,19 @@ constexpr float kSmallestScale = 0.05f, kScaleRate = 0.11356532f;  // ln(1280) /
 constexpr float kHighestLevel = 63.f, kLeastProbability = 1.f / 65536.f;
 constexpr float kLargestSize = 4.f, kRounding = 1.f / 12.f;
 
-// The plan of a step: phase and sharpness of rounding, and the factor of its tangent; whether steps
-// follow the networks, and gradients the steps.
+// The plan of a step: phase and sharpness of rounding, and the factor of its tangent, or where both stand when a step is
+// replayed; whether steps follow the networks, and gradients the steps.
 struct Plan {
   int phase;
   float sharpness, half;
+  const float* soft;
   bool adaptive, moves_steps;
+
+  SW_WISP_HD Plan now() const {
+    Plan found = *this;
+    if (soft != nullptr) found.sharpness = soft[0], found.half = soft[1];
+    return found;
+  }
 };
 
 // One block of all rows.
@@ -126,7 +133,7 @@ SW_WISP_HD Drawn<Math> drawn(const Plan& plan, Real value, Real mean, Real step,
 // as they are drawn, part by part: what is told of one moves the next.
 template <class Math, class Real = typename Math::Real>
 SW_WISP_HD void draw_block(const Block& block, const Draw& of, int64_t row) {
-  const Plan& plan = of.plan;
+  const Plan plan = of.plan.now();
   const int width = block.width;
   const float* const features = (block.start == kKnown ? of.view_inputs : of.inputs) + row * kInputs;
   const float *means = of.outputs + row * kOutputs + block.outputs, *scales = means + width, *turns = scales + width;
@@ -181,7 +188,8 @@ SW_WISP_HD void draw_block(const Block& block, const Draw& of, int64_t row) {
 template <class Math, class Real = typename Math::Real>
 SW_WISP_HD void draw_back(const Block& block, const DrawBack& of, int64_t row) {
   const Real zero = Math::number(0.f), one = Math::number(1.f);
-  const bool moves = of.plan.adaptive && of.plan.moves_steps;
+  const Plan plan = of.plan.now();
+  const bool moves = plan.adaptive && plan.moves_steps;
   Real first = zero, second = zero;
   const int scales = block.width, steps = 2 * block.width;
   const float* const outputs = of.outputs + row * kOutputs + block.outputs;
@@ -191,7 +199,7 @@ SW_WISP_HD void draw_back(const Block& block, const DrawBack& of, int64_t row) {
     const int column = block.start + i;
     const int64_t at = row * kNumbers + column;
     const Real unit = Math::number(of.base_steps[column]), by_drawn = given(of.by_drawn, at);
-    const Drawn<Math> own = drawn<Math>(of.plan, Math::load(of.values + at, kNumbers),
+    const Drawn<Math> own = drawn<Math>(plan, Math::load(of.values + at, kNumbers),
                                         Math::load(of.mean + at, kNumbers), Math::load(of.steps + at, kNumbers),
                                         given(of.noise, at));
     Math::store(of.to_values + at, kNumbers, by_drawn * own.by_value);

@@ -191,3 +191,15 @@ class Watched:
             held.get(name) is tensor and tensor.data_ptr() == address and tensor.requires_grad == learns
             for held, name, tensor, address, learns in self.tensors
         )
+
+
+def plain_values(holder: object, but: Collection[str] = ()) -> list[Any]:
+    """Return an object's numbers and strings, which decide the operators that run, but those that are named."""
+    return [(name, value) for name, value in vars(holder).items() if _is_plain(value) and name not in but]
+
+
+def _is_plain(value: Any) -> bool:
+    return type(value) in _PLAIN or (type(value) is tuple and all(type(each) in _PLAIN for each in value))
+
+
+_PLAIN = (bool, int, float, str)
