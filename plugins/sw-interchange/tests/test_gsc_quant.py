@@ -7,7 +7,15 @@ import pytest
 import torch
 from sw_interchange.gsc_quant import RANGES, GscQuantCodec, clipped_attributes
 
-from splatwizard_core.api import BitstreamError, ContainerReader, ContainerWriter, GaussianModel, UserInputError
+from splatwizard_core.api import (
+    BitstreamError,
+    ContainerReader,
+    ContainerWriter,
+    GaussianModel,
+    SplatwizardError,
+    UserInputError,
+)
+from splatwizard_core.coding import limits
 from splatwizard_core.plugins import load_plugins
 
 
@@ -112,6 +120,16 @@ def test_more_bits_make_larger_files():
     sizes = [len(written(model, position_bits=position, bits=bits)) for position, bits in rates]
     assert sizes == sorted(sizes)
     assert len(set(sizes)) == 5
+
+
+def test_a_model_may_be_larger_than_what_any_file_may_stand_for(monkeypatch):
+    """The file that it is written to counts."""
+    monkeypatch.setattr(limits, "FREE", 0)
+    model = model_of()
+    assert read(written(model)).num_rows == model.num_rows
+    monkeypatch.setattr(limits, "EXPANSION", 1)
+    with pytest.raises(SplatwizardError, match=r"of 70,800 bytes in [1-9][\d,]+ bytes of file"):
+        written(model)
 
 
 @pytest.mark.parametrize(("n", "degree"), [(0, 3), (1, 0), (2, 1), (5, 2)])

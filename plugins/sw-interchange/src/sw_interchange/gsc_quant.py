@@ -83,7 +83,6 @@ class GscQuantCodec:
             num_gaussians=model.num_rows, sh_degree=degree, position_bits=self.settings.position_bits, bits=bits,
             range_auto=auto, ranges={name: [each.low.tolist(), each.high.tolist()] for name, each in ranges.items()},
         )  # fmt: skip
-        writer.allow(decoded_bytes(model.num_rows, degree), f"a model of {model.num_rows:,} Gaussians")
         if not model.num_rows:
             return
         octree = self.plugins.position_codecs.load(POSITIONS)()
@@ -96,6 +95,7 @@ class GscQuantCodec:
             spread = ranges[attribute]
             codes = spread.quantize(found if name != "rotation" else unit_quaternions(found, spread, bits), bits)
             writer.add(name, columns.encode(codes, None))
+        writer.allow(decoded_bytes(model.num_rows, degree), f"a model of {model.num_rows:,} Gaussians")
 
     def decode(self, reader: ContainerReader) -> GaussianModel:
         """Return the model. Raises BitstreamError."""

@@ -96,7 +96,6 @@ class Tmc13(Method):
             num_gaussians=model.num_rows, sh_degree=degree, position_bits=opt.position_bits, bits=opt.bits,
             range_auto=auto, ranges={name: [each.low.tolist(), each.high.tolist()] for name, each in ranges.items()},
         )  # fmt: skip
-        writer.allow(gsc_quant.decoded_bytes(model.num_rows, degree), f"a model of {model.num_rows:,} Gaussians")
         if not model.num_rows:
             return
         cells = ranges["position"].quantize(values["position"], opt.position_bits)
@@ -113,6 +112,7 @@ class Tmc13(Method):
                 content = tmc3.stream_of(without_geometry(units, geometry))
                 columns.append(struct.pack("<I", len(content)) + content)
             writer.add(name, b"".join(columns))
+        writer.allow(gsc_quant.decoded_bytes(model.num_rows, degree), f"a model of {model.num_rows:,} Gaussians")
 
     def decode(self, reader: ContainerReader) -> SplatModel:
         """Return the model. Raises BitstreamError, CapabilityError without the program."""
