@@ -38,8 +38,14 @@ NUMBER: Rule = (_is(int, float), "a number")
 COUNT: Rule = (lambda value: _is(int)(value) and value >= 0, "a whole number")
 FLAG: Rule = (_is(bool), "True or False")
 NAMES: Rule = (_names, "a list of names")
-SUFFIXED: Rule = (lambda value: isinstance(value, str) and value.startswith(".") and len(value) > 1, 'such as ".ply"')
-SUFFIX: Rule = (lambda value: value == "" or SUFFIXED[0](value), 'such as ".ply", or "" (by --format alone)')
+SUFFIX: Rule = (
+    lambda value: value == "" or (isinstance(value, str) and value.startswith(".") and len(value) > 1),
+    'such as ".ply", or "" (by --format alone)',
+)
+SUFFIXED: Rule = (
+    lambda value: isinstance(value, str) and bool(re.fullmatch(r"[\w-]*(\.[\w-]+)+", value)),
+    'such as ".ply", or the name of a file such as "meta.json"',
+)
 WHERE: Rule = (lambda value: isinstance(value, str) and bool(TARGET.fullmatch(value)), '"module:attribute"')
 FIGURES: Rule = (
     lambda value: isinstance(value, str) and bool(DECLARED.fullmatch(value)),
