@@ -17,8 +17,8 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "other_protocols.md"
 MADE = re.compile(r"(<!-- made by benchmarks/protocol_page.py -->\n).*?(<!-- end -->)", re.S)
 RECORDS = ("gsc.csv", "gsc_bd.csv", "correlations.csv", "splits.csv", "distances.csv")
-FIGURES = ("chair", "room", "room-2")
-"""Scenes whose sheet of distances the page shows; `room-2` is room's second protocol, the sector."""
+FIGURES = ("chair", "room", "room@2")
+"""Scenes whose sheet of distances the page shows; `room@2` is room's second protocol, the sector."""
 
 
 def sections(text: str) -> dict[str, str]:
@@ -50,8 +50,9 @@ def figures(out: Path) -> list[str]:
     for name in FIGURES:
         drawn = out / "figures" / f"distance-{name}.svg"
         if drawn.is_file():
-            shutil.copyfile(drawn, PAGE.parent / "images" / drawn.name)
-            lines += ["", f"![{name}: means of four groups of test views against their distance](images/{drawn.name})"]
+            kept = drawn.name.replace("@", "-")
+            shutil.copyfile(drawn, PAGE.parent / "images" / kept)
+            lines += ["", f"![{name}: means of four groups of test views against their distance](images/{kept})"]
     return lines
 
 

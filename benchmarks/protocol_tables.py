@@ -16,12 +16,14 @@ gsc         `sw bench --protocol mpeg-gsc` of every scene's model (that of --mod
 scores      `sw eval` of every file of `gsc` on the same views, against the photographs, by all metrics; and of every
             run under OUT/train and --runs DIR on its own test views. Records of earlier releases lack distances:
             `path_distances.py` adds them.
-tables      OUT/tables.md, gsc.csv, gsc_bd.csv, correlations.csv, splits.csv, distances.csv, distance.html, and figures
-            of the distances where matplotlib is. `protocol_page.py OUT` puts them into docs/other_protocols.md.
+tables      From what is there, rate points of codecs that were cut off included: OUT/tables.md, gsc.csv, gsc_bd.csv,
+            correlations.csv, splits.csv, distances.csv, distance.html, and figures of the distances where matplotlib
+            is. `protocol_page.py OUT` puts them into docs/other_protocols.md.
 
 Metrics whose package or weights are not there are `not available`, and missing in the tables. --set
 metrics.lpips.weights=DIR says where LPIPS finds its weights. Processes run side by side, --gsc-jobs of gsc and scores
-on the same GPUs; seconds of encoding and decoding are then those of a shared machine.
+on the same GPUs, so that the tables leave seconds and memory out. Where the anchor is not coded, others are set against
+3DGS's own codec.
 
 Correlations are over renders: one view of one decoded file. Every metric is turned so that higher is better. `pooled`
 takes all renders together, where views differ more than codecs; `within` is the mean over views of the correlation over
@@ -70,7 +72,8 @@ from splatwizard_core.tooling import PluginManager, load_plugins, load_scene
 SW = [sys.executable, "-m", "splatwizard_core"]
 SCENES = ("chair", "lego", "room", "fox")
 BLACK = "background=black"
-ANCHOR = "gsc-quant"
+ANCHOR, SECOND_ANCHOR = "gsc-quant", "3dgs"
+SHARED = ("enc_s", "dec_s", "rss_enc_mb", "rss_dec_mb")
 MODEL_RATE = "r6"  # of 3dgs: float32, as trained
 SPLIT_SCENE, SECTOR = "room", "sector:60@130"
 SPLIT_METHODS = (("3dgs", MODEL_RATE, 30_000), ("hac-plus", "r4", 30_000), ("cat-3dgs", "r6", 40_000),
@@ -78,11 +81,14 @@ SPLIT_METHODS = (("3dgs", MODEL_RATE, 30_000), ("hac-plus", "r4", 30_000), ("cat
 """Method, its default rate point (3dgs: without a loss), steps of preset paper."""
 STARTS = {"wisp": 30_000}  # steps of the 3DGS scene that it starts from
 FULL_STEPS = 30_000
+RECORDS = Path(__file__).resolve().parents[1] / "docs" / "records"
 MOST_VIEWS = 32
 LEAST_FILES = 8  # that show a view, for a correlation within it
 METRICS = ("psnr", "ssim", "l1", "lpips_vgg_3dgs", "lpips_vgg", "lpips_alex", "cc_psnr", "cc_ssim", "flip", "ms_ssim",
            "haarpsi", "fsim", "vsi", "gmsd", "cvvdp")  # fmt: skip
 SPLIT_METRICS = ("psnr", "ssim", "lpips_vgg_3dgs")
+SPLIT_COLUMNS = ("method", "rate", "metric", "every8", "every8_in_sector", "sector", "fall", "views_every8",
+                 "views_sector", "protocol_every8", "protocol_sector", "steps_every8", "steps_sector")  # fmt: skip
 AGAINST_SOURCE = ("psnr_rgb", "psnr_yuv", "ssim_yuv", "om_psnr_rgb", "om_ssim_yuv")
 """Scores of the protocol against renders of the source model, all higher is better."""
 PARTS = ("train", "gsc", "scores", "tables")
@@ -238,10 +244,57 @@ def run_gsc(
     print(f"gsc: {dict(run_jobs(together, args))}")
 
 
-def gsc_rows(scenes: Iterable[str], args: argparse.Namespace) -> list[dict[str, Any]]:
-    """Rows of all scenes whose codecs are coded."""
-    files = (gsc_folder(scene, args) / "all.done.json" for scene in scenes)
-    return [row for file in files if file.is_file() for row in json.loads(file.read_bytes())["rows"]]
+def gsc_rows(args: argparse.Namespace) -> list[dict[str, Any]]:
+    """Rows of every scene that has a folder, which names them: of finished codecs, and of rate points of unfinished.
+
+    Without what other processes on the machine falsify: seconds and memory.
+    """
+    rows = []
+    for folder in sorted(args.out.glob("gsc/*/mpeg-gsc")):
+        scene, found = folder.parent.name, []
+        if (whole := folder / "all.done.json").is_file():
+            found = json.loads(whole.read_bytes())["rows"]
+        else:
+            for done in sorted(folder.glob("*.done.json")):
+                found += json.loads(done.read_bytes())["rows"]
+            known = {row["codec"] for row in found}
+            for file in sorted(folder.glob("*/*/r*.json")):
+                if file.parent.name not in known:
+                    found.append(json.loads(file.read_bytes())["row"])
+        rows += [{**row, "sequence": scene, **dict.fromkeys(SHARED)} for row in found]
+    return rows
+
+
+def distinct(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Rows where neighbouring rate points of a codec whose files do not differ are one, `r1 to r4`."""
+
+    def same(row: Mapping[str, Any]) -> Any:
+        return [row.get(key) for key in ("sequence", "codec", "bytes", "psnr_rgb_pooled", "reason")]
+
+    found = []
+    for _, each in itertools.groupby(rows, key=same):
+        group = list(each)
+        rates = [row["rate"] for row in group]
+        found.append({**group[0], "rate": rates[0] if len(rates) == 1 else f"{rates[0]} to {rates[-1]}"})
+    return found
+
+
+def unfinished(rows: Sequence[Mapping[str, Any]], rates: Mapping[str, Sequence[str]]) -> dict[str, dict[str, str]]:
+    """Scene -> codec -> its rate points that have no row, of codecs that have some in any scene."""
+    found: dict[str, dict[str, str]] = {}
+    for scene in dict.fromkeys(row["sequence"] for row in rows):
+        there = {(row["codec"], row["rate"]) for row in rows if row["sequence"] == scene}
+        for codec, of_codec in rates.items():
+            missing = [rate for rate in of_codec if (codec, rate) not in there]
+            if missing and any(codec == name for name, _ in there):
+                found.setdefault(scene, {})[codec] = ", ".join(missing)
+    return found
+
+
+def reference_of(of_scene: Iterable[Mapping[str, Any]]) -> str:
+    """Codec that others are set against: the anchor, or where it is not coded the codec that has a curve."""
+    coded = {row["codec"] for row in of_scene if row["bytes"] is not None}
+    return ANCHOR if ANCHOR in coded else SECOND_ANCHOR
 
 
 # Metrics
@@ -346,14 +399,18 @@ def pearson(a: Sequence[float], b: Sequence[float]) -> float | None:
 # Tables
 
 
-def write_tables(scenes: Sequence[str], args: argparse.Namespace) -> None:
+def write_tables(args: argparse.Namespace) -> None:
     """Write everything that can be told from what is there."""
-    rows = gsc_rows(scenes, args)
-    bd = bd_rows(rows, ANCHOR) if rows else []
-    (args.out / "gsc.csv").write_text(csv_text(COLUMNS, rows))
+    rows = gsc_rows(args)
+    by_scene = [list(group) for _, group in itertools.groupby(rows, key=lambda row: row["sequence"])]
+    bd = []
+    for anchor in (ANCHOR, SECOND_ANCHOR):
+        those = [row for of_scene in by_scene if reference_of(of_scene) == anchor for row in distinct(of_scene)]
+        bd += bd_rows(those, anchor)
+    (args.out / "gsc.csv").write_text(csv_text([name for name in COLUMNS if name not in SHARED], rows))
     (args.out / "gsc_bd.csv").write_text(csv_text(BD_COLUMNS, bd))
     trained = [folder for folder in (args.out / "train", *args.runs) if any(folder.rglob("metrics.json"))]
-    text = [*gsc_section(rows, bd), *correlation_section(rows, args), *split_section(args)]
+    text = [*gsc_section(rows, bd, args.rates), *correlation_section(rows, args), *split_section(args)]
     text += distance_section(trained, args.out)
     (args.out / "tables.md").write_text("\n".join(text) + "\n")
     if trained:
@@ -362,63 +419,87 @@ def write_tables(scenes: Sequence[str], args: argparse.Namespace) -> None:
     print(f"written: {args.out / 'tables.md'}, CSV files, distance.html")
 
 
-def gsc_section(rows: Sequence[dict[str, Any]], bd: Sequence[dict[str, Any]]) -> list[str]:
-    """BD-rates, and every point of every codec."""
+def gsc_section(
+    rows: Sequence[dict[str, Any]], bd: Sequence[dict[str, Any]], rates: Mapping[str, Sequence[str]]
+) -> list[str]:
+    """Bytes at equal PSNR, BD-rates, what is missing, and every point of every codec."""
     if not rows:
         return []
-    scenes = sorted({row["sequence"] for row in rows})
+    scenes = {scene: distinct(each) for scene, each in itertools.groupby(rows, key=lambda row: row["sequence"])}
+    references = {scene: reference_of(of_scene) for scene, of_scene in scenes.items()}
     lines = [f"## Models through codecs, {TITLE}", ""]
     lines += [
-        f"BD-rate against `{ANCHOR}`, %: RGB-PSNR / YUV-PSNR / YUV-SSIM. Codecs with fewer than four points have "
+        "Bytes over those of another codec's curve at the same pooled RGB-PSNR against renders of the source; a dash "
+        "is a PSNR that the curve does not reach. Rate points whose files do not differ are one.",
+        "",
     ]
-    lines += [f"none: their bytes over those of `{ANCHOR}` at the same pooled PSNR stand in the scenes' tables.", ""]
-    lines += _head(["codec", *scenes, "mean"])
-    for codec in dict.fromkeys(row["codec"] for row in bd):
+    lines += _head(["codec", *(f"{scene}, over `{references[scene]}`" for scene in scenes)])
+    for codec in dict.fromkeys(row["codec"] for row in rows):
         cells = []
-        for scene in (*scenes, "mean"):
-            found = next((row for row in bd if (row["codec"], row["sequence"]) == (codec, scene)), None)
-            cells.append("-" if found is None else " / ".join(_percent(found[f"bd_{name}"]) for name in QUALITIES))
-        lines.append(_line([codec, *cells]))
+        for of_scene in scenes.values():
+            points = [row for row in of_scene if row["codec"] == codec and row["bytes"] is not None]
+            told = [(row["rate"], times_anchor(row, of_scene)) for row in points]
+            cells.append(", ".join(f"{rate}: {ratio:.2f}" for rate, ratio in told if ratio is not None) or "-")
+        if set(cells) != {"-"}:
+            lines.append(_line([codec, *cells]))
+    lines.append("")
+    for anchor in dict.fromkeys(references.values()):
+        those = [scene for scene in scenes if references[scene] == anchor]
+        coded = [row["codec"] for row in bd if row["anchor"] == anchor]
+        if not coded:
+            lines += [f"BD-rates against `{anchor}` ({', '.join(those)}): none, no other codec has four points.", ""]
+            continue
+        lines += [f"BD-rate against `{anchor}`, %: RGB-PSNR / YUV-PSNR / YUV-SSIM; four points or more.", ""]
+        lines += _head(["codec", *those])
+        for codec in dict.fromkeys(coded):
+            cells = []
+            for scene in those:
+                found = next((row for row in bd if (row["codec"], row["sequence"]) == (codec, scene)), None)
+                cells.append("-" if found is None else " / ".join(_percent(found[f"bd_{name}"]) for name in QUALITIES))
+            lines.append(_line([codec, *cells]))
+        lines.append("")
+    missing = unfinished(rows, rates)
+    if missing:
+        each = (f"{scene} ({'; '.join(f'{c} {r}' for c, r in of.items())})" for scene, of in missing.items())
+        lines += [f"Not coded, the run was cut off: {', '.join(each)}.", ""]
     head = ["codec", "rate", "bytes", "bits/splat", "PSNR RGB", "pooled", "PSNR YUV", "SSIM YUV", "photographs: PSNR",
-            "drop", f"x {ANCHOR}", "encode s", "decode s", "remarks"]  # fmt: skip
-    for scene in scenes:
-        of_scene = [row for row in rows if row["sequence"] == scene]
-        first = of_scene[0]
+            "drop", "x bytes", "remarks"]  # fmt: skip
+    for scene, of_scene in scenes.items():
         views = next((row["views"] for row in of_scene if row["bytes"] is not None), 0)
+        first = of_scene[0]
         lines += [
-            "",
             f"### {scene}",
             "",
-            f"{first['splats_source']:,} splats, {views} views, `{first['protocol']}`",
+            f"{first['splats_source']:,} splats, {views} views, `{first['protocol']}`; x bytes: over "
+            f"`{references[scene]}` at the same pooled PSNR",
             "",
         ]
         lines += _head(head)
         for row in of_scene:
             if row["bytes"] is None:
-                lines.append(
-                    _line([row["codec"], row["rate"], *["-"] * 11, f"{row['flags']}: {row.get('reason', '')}"])
-                )
+                why = f"{row['flags']}: {row.get('reason', '')}"
+                lines.append(_line([row["codec"], row["rate"], *["-"] * 9, why]))
                 continue
             photos = row.get("photos", {}).get("psnr", {})
             lines.append(_line([
                 row["codec"], row["rate"], f"{row['bytes']:,}", _number(row["bits_per_splat"], 1),
                 _number(row["psnr_rgb"]), _number(row["psnr_rgb_pooled"]), _number(row["psnr_yuv"]),
                 _number(row["ssim_yuv"], 4), _number(photos.get("decoded")), _number(photos.get("drop")),
-                _number(times_anchor(row, of_scene)),
-                _number(row["enc_s"]), _number(row["dec_s"]), row["flags"],
+                _number(times_anchor(row, of_scene)), row["flags"],
             ]))  # fmt: skip
-    return [*lines, ""]
+        lines.append("")
+    return lines
 
 
-def times_anchor(row: Mapping[str, Any], of_scene: Iterable[Mapping[str, Any]]) -> float | None:
+def times_anchor(row: Mapping[str, Any], of_scene: Sequence[Mapping[str, Any]]) -> float | None:
     """Bytes of a rate point over those of the anchor's curve at its RGB-PSNR; None where that does not reach it.
 
     PSNR is pooled, which is defined for all points but exact ones.
     """
-    key = "psnr_rgb_pooled"
+    key, anchor = "psnr_rgb_pooled", reference_of(of_scene)
     curve = [CurvePoint(each["rate"], each["bytes"], each[key]) for each in of_scene
-             if each["codec"] == ANCHOR and each["bytes"] is not None and each[key] is not None]  # fmt: skip
-    if row[key] is None or row["codec"] == ANCHOR:
+             if each["codec"] == anchor and each["bytes"] is not None and each[key] is not None]  # fmt: skip
+    if row[key] is None or row["codec"] == anchor:
         return None
     ratio = at_equal(curve, row[key], row["bytes"]).ratio
     return None if ratio is None else 1 / ratio
@@ -464,32 +545,66 @@ def correlation_section(rows: Sequence[dict[str, Any]], args: argparse.Namespace
 
 
 def split_section(args: argparse.Namespace) -> list[str]:
-    """Every 8th view against a sector: means over the held-out views, and the fall."""
-    lines, table = [], []
+    """Every 8th view against a sector: means over the held-out views, and the fall.
+
+    Where a method lacks the first, the project's record of the full plan stands for it, which its steps say. A row of
+    OUT/splits.csv whose records are not there any more stays.
+    """
+    lines, table, ids = [], [], set()
+    written = args.out / "splits.csv"
+    earlier = list(csv.DictReader(written.open(newline=""))) if written.is_file() else []
     for method, rate, _ in SPLIT_METHODS:
         cells = [Cell(label, method, str(args.data / SPLIT_SCENE), rate) for label in (method, f"{method}-sector")]
         files = [cell.directory(args.out / "train") / "metrics.json" for cell in cells]
-        if not all(file.is_file() for file in files):
+        if not files[1].is_file():
+            for row in earlier:
+                if row["method"] == method:
+                    told = [row[key] for key in SPLIT_COLUMNS[7:11]]
+                    ids.add((int(told[0]), int(told[1]), *told[2:]))
+                    means = [float(row[key]) if row[key] else None for key in SPLIT_COLUMNS[3:7]]
+                    steps = [int(row[key]) if row.get(key) else None for key in SPLIT_COLUMNS[11:]]
+                    table.append([method, rate, row["metric"], *means, *told, *steps])
             continue
-        near, far = (json.loads(file.read_bytes()) for file in files)
+        far = json.loads(files[1].read_bytes())
+        near = json.loads(files[0].read_bytes()) if files[0].is_file() else None
+        kept = None if near is not None else recorded(method, rate)
         for name in SPLIT_METRICS:
-            means = [_mean_of(near, name), _mean_of(near, name, set(far["views"])), _mean_of(far, name)]
-            fall = None if None in (means[0], means[2]) else means[0] - means[2]  # type: ignore[operator]
-            table.append([method, rate, name, *means, fall, near["test_views"], far["test_views"],
-                          near["protocol"]["id"], far["protocol"]["id"]])  # fmt: skip
-    heads = ["method", "rate", "metric", "every8", "every8_in_sector", "sector", "fall", "views_every8", "views_sector",
-             "protocol_every8", "protocol_sector"]  # fmt: skip
-    with (args.out / "splits.csv").open("w", newline="") as file:
+            if near is not None:
+                means = [_mean_of(near, name), _mean_of(near, name, set(far["views"])), _mean_of(far, name)]
+                views, protocol, steps = near["test_views"], near["protocol"]["id"], near["train"]["steps"]
+            elif kept is not None:
+                means = [kept.get(name), None, _mean_of(far, name)]
+                views, protocol, steps = kept["test_views"], kept["protocol"], kept["steps"]
+            else:
+                continue
+            if means[0] is None:
+                continue
+            told = [views, far["test_views"], protocol, far["protocol"]["id"]]
+            ids.add(tuple(told))
+            fall = None if means[2] is None else means[0] - means[2]
+            table.append([method, rate, name, *means, fall, *told, steps, far["train"]["steps"]])
+    with written.open("w", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows(
-            [heads, *([("" if v is None else v) for v in r] for r in table)]
+            [SPLIT_COLUMNS, *([("" if v is None else v) for v in r] for r in table)]
         )
     if not table:
         return []
     lines += [f"## Every 8th view against `{SECTOR}` on {SPLIT_SCENE}", ""]
-    lines += [f"`{table[0][9]}` ({table[0][7]} views held out) and `{table[0][10]}` ({table[0][8]} views)", ""]
-    lines += _head(["method", "rate", "metric", "every8", "every8, views inside the sector", "sector", "fall"])
-    lines += [_line([*row[:3], *(_number(v, 2 if row[2] == "psnr" else 4) for v in row[3:7])]) for row in table]
+    for first, second, near_id, far_id in sorted(ids):
+        lines += [f"`{near_id}` ({first} views held out) and `{far_id}` ({second} views)", ""]
+    lines += _head(["method", "rate", "metric", "every8", "every8, views inside the sector", "sector", "fall", "steps"])
+    for row in table:
+        near_steps, far_steps = ("-" if n is None else f"{n:,}" for n in row[11:13])
+        steps = near_steps if near_steps == far_steps else f"{near_steps}, sector {far_steps}"
+        lines.append(_line([*row[:3], *(_number(v, 2 if row[2] == "psnr" else 4) for v in row[3:7]), steps]))
     return [*lines, ""]
+
+
+def recorded(method: str, rate: str) -> dict[str, Any] | None:
+    """The project's record of a method on the scene of the splits, every 8th view held out, paper's plan in full."""
+    lines = (RECORDS / f"{SPLIT_SCENE}.jsonl").read_text().splitlines()
+    found = (each for line in lines if (each := json.loads(line))["method"] == method and each["rate"] == rate)
+    return next((each for each in found if each["preset"] == "paper" and not each["variant"]), None)
 
 
 def distance_section(folders: Sequence[Path], out: Path) -> list[str]:
@@ -583,7 +698,9 @@ def main() -> None:
         if "scores" in parts:
             run_scores(models, views, args)
     if "tables" in parts:
-        write_tables(scenes, args)
+        declared = {e.name: e.declared for e in load_plugins().methods if e.declared.get("training_free")}
+        args.rates = {name: of["rates"] for name, of in declared.items() if len(of.get("rates") or []) > 1}
+        write_tables(args)
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import shutil
 import sys
 from argparse import Namespace
 from pathlib import Path
@@ -50,6 +51,32 @@ def test_a_size_beside_the_anchor_is_at_the_same_psnr(script):
     assert script.times_anchor(point("spz", "r2", 300, 51.0), rows) is None
 
 
+def test_a_codec_that_was_cut_off_counts_with_its_points(script, tmp_path):
+    def row(codec: str, rate: str, size: int | None, psnr: float | None = None) -> dict[str, Any]:
+        return {"sequence": "x", "codec": codec, "rate": rate, "bytes": size, "psnr_rgb_pooled": psnr, "enc_s": 1.0}
+
+    folder = tmp_path / "gsc" / "room" / "mpeg-gsc"
+    for each in (row("3dgs", "r1", 100, 40.0), row("3dgs", "r2", 200, 45.0), row("spz", "r1", 1, 1.0)):
+        file = folder / "room" / each["codec"] / f"{each['rate']}.json"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(json.dumps({"row": each}))
+    done = [row("spz", "r1", 300, 45.0), row("spz", "r2", 300, 45.0), row("gsc-quant", "r1", None)]
+    for codec in ("spz", "gsc-quant"):
+        mine = [each for each in done if each["codec"] == codec]
+        (folder / f"{codec}.done.json").write_text(json.dumps({"rows": mine}))
+    rows = script.gsc_rows(Namespace(out=tmp_path))
+    assert {each["sequence"] for each in rows} == {"room"}
+    assert {each["enc_s"] for each in rows} == {None}
+    points = [(each["codec"], each["rate"], each["bytes"]) for each in script.distinct(rows)]
+    assert points == [
+        ("gsc-quant", "r1", None), ("spz", "r1 to r2", 300), ("3dgs", "r1", 100), ("3dgs", "r2", 200),
+    ]  # fmt: skip
+    rates = {"3dgs": ["r1", "r2", "r3"], "spz": ["r1", "r2"], "c3dgs": ["r1"]}
+    assert script.unfinished(rows, rates) == {"room": {"3dgs": "r3"}}
+    assert script.reference_of(rows) == "3dgs"
+    assert script.times_anchor(rows[1], rows) == pytest.approx(300 / 200)
+
+
 def test_metrics_are_turned_so_that_higher_is_better_and_views_are_told_apart(script, tmp_path):
     """Within each view b falls where a rises, and between views it rises with it."""
     for i in range(8):
@@ -80,11 +107,20 @@ def test_the_fall_is_from_every_eighth_view_to_the_sector(script, tmp_path):
         folder = script.Cell(label, "3dgs", "room", "r6").directory(tmp_path / "train")
         folder.mkdir(parents=True)
         metric = {"mean": sum(values) / 2, "per_view": values}
-        record = {"views": views, "test_views": 2, "metrics": {"psnr": metric}, "protocol": {"id": f"room/{label}"}}
+        record = {"views": views, "test_views": 2, "metrics": {"psnr": metric}, "protocol": {"id": f"room/{label}"},
+                  "train": {"steps": 15_000}}  # fmt: skip
         (folder / "metrics.json").write_text(json.dumps(record))
+    folder = script.Cell("cat-3dgs-sector", "cat-3dgs", "room", "r6").directory(tmp_path / "train")
+    folder.mkdir(parents=True)
+    (folder / "metrics.json").write_text(json.dumps(record))
     lines = script.split_section(Namespace(out=tmp_path, data=Path()))
-    assert "| 3dgs | r6 | psnr | 25.00 | 20.00 | 20.00 | 5.00 |" in lines
-    assert "3dgs,r6,psnr,25.0,20.0,20.0,5.0,2,2,room/3dgs,room/3dgs-sector" in (tmp_path / "splits.csv").read_text()
+    assert "| 3dgs | r6 | psnr | 25.00 | 20.00 | 20.00 | 5.00 | 15,000 |" in lines
+    row = "3dgs,r6,psnr,25.0,20.0,20.0,5.0,2,2,room/3dgs,room/3dgs-sector,15000,15000"
+    assert row in (tmp_path / "splits.csv").read_text()
+    kept = script.recorded("cat-3dgs", "r6")["psnr"]  # of the full plan, where every eighth view is not there
+    assert f"| cat-3dgs | r6 | psnr | {kept:.2f} | - | 20.00 | {kept - 20:.2f} | 40,000, sector 15,000 |" in lines
+    shutil.rmtree(tmp_path / "train")
+    assert lines == [*script.split_section(Namespace(out=tmp_path, data=Path()))]  # rows stay
 
 
 def test_the_page_takes_the_sections_that_there_are_and_keeps_the_others(script):
