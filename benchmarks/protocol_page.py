@@ -17,8 +17,8 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "other_protocols.md"
 MADE = re.compile(r"(<!-- made by benchmarks/protocol_page.py -->\n).*?(<!-- end -->)", re.S)
 RECORDS = ("gsc.csv", "gsc_bd.csv", "correlations.csv", "splits.csv", "distances.csv")
-FIGURES = ("chair", "room", "room@2")
-"""Scenes whose sheet of distances the page shows; `room@2` is room's second protocol, the sector."""
+FIGURES = {"chair": "chair", "room": "room", "room@2": "room, its second protocol"}
+"""Scenes whose sheet of distances the page shows, and what they are called."""
 
 
 def sections(text: str) -> dict[str, str]:
@@ -47,12 +47,12 @@ def filled(page: str, tables: str) -> str:
 def figures(out: Path) -> list[str]:
     """Lines that show the figures of distances which OUT has, copied beside the page."""
     lines = []
-    for name in FIGURES:
+    for name, told in FIGURES.items():
         drawn = out / "figures" / f"distance-{name}.svg"
         if drawn.is_file():
             kept = drawn.name.replace("@", "-")
             shutil.copyfile(drawn, PAGE.parent / "images" / kept)
-            lines += ["", f"![{name}: means of four groups of test views against their distance](images/{kept})"]
+            lines += ["", f"![{told}: means of four groups of test views against their distance](images/{kept})"]
     return lines
 
 
