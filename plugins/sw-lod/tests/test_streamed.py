@@ -97,6 +97,15 @@ def test_other_names_are_refused(model, tmp_path, out, told):
         write_lod(model, tmp_path / out)
 
 
+@pytest.mark.parametrize("name", ["lod-meta.json", "scene.swz"])
+def test_the_file_that_is_read_is_not_replaced(tmp_path, name):
+    file = tmp_path / name
+    file.write_bytes(b"source")
+    with pytest.raises(UserInputError, match="the file that is read"):
+        write_lod(file, file)
+    assert file.read_bytes() == b"source"
+
+
 @pytest.mark.parametrize("chunk", ["0", "-1", "8 mb", "1e9", "99999999999k", "10"])
 def test_a_size_of_pieces_that_makes_no_sense_is_refused(tmp_path, chunk):
     file = tmp_path / "scene.ply"

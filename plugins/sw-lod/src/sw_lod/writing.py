@@ -57,6 +57,8 @@ def write_lod(
     """
     started = time.perf_counter()
     target = _target(out)
+    if not isinstance(given, GaussianModel) and target.exists() and target.samefile(existing_file(str(given))):
+        raise UserInputError(f"{target} is the file that is read: give --out another name")
     if levels is not None and not 1 <= levels <= 64:
         raise UserInputError(f"--levels {levels}: 1 to 64 are possible")
     if chunk is not None and chunk < SMALLEST_CHUNK:
