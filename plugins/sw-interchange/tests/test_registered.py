@@ -180,6 +180,17 @@ def test_info_tells_what_a_meta_json_describes(ply, tmp_path, capsys):
     assert (facts["kind"], facts["num_gaussians"]) == ("sog-folder", 30)
 
 
+def test_info_tells_what_an_index_of_levels_describes(ply, tmp_path, capsys):
+    (tmp_path / "unit").mkdir()
+    write(read(ply), tmp_path / "unit" / "meta.json", format="sog-folder")
+    leaf = {"bound": {"min": [-9, -9, -9], "max": [9, 9, 9]}, "lods": {"0": {"file": 0, "offset": 0, "count": 30}}}
+    index = {"version": 1, "count": 30, "counts": [30], "lodLevels": 1, "filenames": ["unit/meta.json"], "tree": leaf}
+    (tmp_path / "lod-meta.json").write_text(json.dumps(index))
+    assert main(["info", str(tmp_path / "lod-meta.json"), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert (facts["kind"], facts["num_gaussians"]) == ("streamed-sog", 30)
+
+
 def test_the_cut_of_degree_4_is_told(tmp_path, caplog):
     write(random_scene(5, 4), tmp_path / "a.spz", version=4)
     assert load_plugins().read_gaussians(tmp_path / "a.spz").max_sh_degree == 3

@@ -49,7 +49,8 @@ def info(path: str, as_json: bool, chosen: Choices) -> None:
 
 
 def _holds_gaussians(text: bytes) -> bool:
-    return all(f'"{part}"'.encode() in text for part in ("means", "sh0")) and b'"protocol"' not in text
+    formats = ((b'"means"', b'"sh0"'), (b'"lodLevels"', b'"filenames"'))  # a SOG, an index of streamed ones
+    return b'"protocol"' not in text and any(all(part in text for part in parts) for parts in formats)
 
 
 def _head(path: Path, count: int = -1) -> bytes:
