@@ -121,7 +121,7 @@ def test_surfels_are_packed_as_thin_ellipsoids():
 
 
 def test_models_without_fixed_gaussians_are_refused_in_a_line():
-    with pytest.raises(SceneError, match=r"no fixed Gaussians.*`sw view` draws it"):
+    with pytest.raises(SceneError, match=r"no fixed Gaussians.*`sw view FILE --html PAGE.html`"):
         pack(SplatModel())
 
 

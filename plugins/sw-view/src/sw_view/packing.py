@@ -62,7 +62,7 @@ def explicit(model: SplatModel) -> GaussianModel:
     if not isinstance(model, GaussianModel):
         raise SceneError(
             f"a {type(model).__name__} has no fixed Gaussians, as the page holds: they depend on the camera; "
-            "`sw bake` fits fixed ones, `sw view` draws it here"
+            "`sw view FILE --html PAGE.html` writes a page that decodes files of mode exact, `sw bake` fits fixed ones"
         )
     return as_ellipsoids(model)
 
