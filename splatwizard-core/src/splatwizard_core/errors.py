@@ -105,7 +105,10 @@ class TaskError(SplatwizardError):
     """A schedule task raised; the cause is chained."""
 
     def __init__(self, stage: str, step: int, task: str, cause: BaseException) -> None:
-        super().__init__(f"task '{task}' ({stage}) failed at step {step}: {type(cause).__name__}: {cause}")
+        told = f"{cause}" if isinstance(cause, UserInputError) else f"{type(cause).__name__}: {cause}"
+        super().__init__(f"task '{task}' ({stage}) failed at step {step}: {told}")
+        if isinstance(cause, UserInputError):
+            self.exit_status = cause.exit_status
         self.stage, self.step, self.task = stage, step, task
 
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 from sw_anchors.phase_switch import PhaseSwitch
 
-from splatwizard_core.errors import EmptyModel, TaskError
+from splatwizard_core.errors import EmptyModel, TaskError, UserInputError
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.training.scheduler import STOP, Scheduler, task_name
 from splatwizard_core.training.task_log import TaskLog
@@ -121,6 +121,17 @@ def test_what_a_task_raises_names_stage_step_and_task(context):
         scheduler.exec(3, context)
     assert isinstance(info.value.__cause__, ZeroDivisionError)
     assert (info.value.stage, info.value.step, info.value.task) == ("post", 3, "break things")
+
+
+def test_what_a_task_says_to_the_user_ends_as_wrong_input_does(context):
+    def refuse():
+        raise UserInputError("no file of 5 bytes")
+
+    scheduler = Scheduler("post")
+    scheduler.register_task(3, refuse)
+    with pytest.raises(TaskError, match=r"at step 3: no file of 5 bytes") as info:
+        scheduler.exec(3, context)
+    assert info.value.exit_status == 2
 
 
 def test_an_empty_model_is_reported_as_such(context):
