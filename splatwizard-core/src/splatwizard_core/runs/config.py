@@ -331,6 +331,9 @@ def resolve(
             elif key.startswith(METRICS) and key.count(".") > 1:
                 set_at(settings, key.removeprefix(METRICS), value)
             else:
+                if key in ("size", "gaussians"):  # options of `sw run`, which only some methods take
+                    able = sorted(e.name for e in plugins.methods if not e.foreign and field_at(e.load().Config, key))
+                    raise ConfigError(f"method '{method.name}' takes no {key}, unlike {', '.join(able)}", key=key)
                 known = [k for block in reversed(given) for k in block_keys(block)]
                 raise unknown_key(key, [*known, *config.settings_keys(plugins)], source)
             provenance[key] = source
