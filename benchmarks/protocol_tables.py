@@ -527,7 +527,7 @@ def correlation_section(rows: Sequence[dict[str, Any]], args: argparse.Namespace
         f"{len(values):,} renders of {files} file{'s' * (files != 1)}: {told}.",
         "",
     ]
-    absences = [f"`{name}` ({why})" for name, why in absent.items() if name not in names]
+    absences = [f"`{name}` ({why.partition(':')[0]})" for name, why in absent.items() if name not in names]
     lines += [f"Not available: {'; '.join(absences)}.", ""] if absences else []
     for title, above, below in (
         ("All renders together", "pearson", "spearman"),
