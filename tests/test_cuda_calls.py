@@ -101,7 +101,7 @@ def test_wisp(calls, monkeypatch):
     (back,) = calls["bits_backward"]
     assert (back.rows, back.last, back.to_values is None) == (7, 3, False)
 
-    opacities, covariances, dc, rest = drawable(values, rand(7), (-2.0, 1.0), AppearanceNetwork())
+    opacities, covariances, dc, rest, *_ = drawable(values, rand(7), (-2.0, 1.0), AppearanceNetwork())
     assert (opacities.shape, covariances.shape, dc.shape, rest.shape) == ((7,), (7, 6), (7, 1, 3), (7, 15, 3))
     assert calls["splats"][0].covariances == covariances.data_ptr()
     torch.autograd.grad(covariances, values, rand(7, 6))
