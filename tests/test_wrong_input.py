@@ -393,6 +393,7 @@ def test_wrong_input(row: Row, things: Path, tmp_path: Path, surroundings, capsy
         surroundings.setenv(name, filled(value, things, tmp_path))
         if name == "PYTHONPATH":
             surroundings.syspath_prepend(os.environ[name])
+            surroundings.setattr(sys, "dont_write_bytecode", True)  # beside those modules it would be a new file
         load_plugins.cache_clear()
     before = tree(things, tmp_path)
     status = main(shlex.split(filled(row.line, things, tmp_path)))
