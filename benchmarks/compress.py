@@ -39,7 +39,7 @@ LARGEST_QUALITY = 69.0
 
 
 PARTS = {"precision": ("PRECISION_POWER", 0.0), "basis": ("OWN_BASIS", False), "pruning": ("SHARES", (1.0,))}
-"""What `--without` takes away, as a constant of sw-compress and its value without."""
+"""Parts that `--without` takes away, each as a constant of sw-compress and its value without."""
 
 
 def compared(path: Path, device: str, baselines: list[str]) -> list[dict[str, Any]]:

@@ -38,7 +38,7 @@ def imported(path: Path, *, types: bool = False) -> tuple[str, ...]:
 
 @cache
 def _imports(path: Path) -> list[tuple[str, bool]]:
-    """Those names, and whether each stands under `if TYPE_CHECKING:`."""
+    """Imported names, and whether each stands under `if TYPE_CHECKING:`."""
     found: list[tuple[str, bool]] = []
 
     def visit(node: ast.AST, for_types: bool) -> None:

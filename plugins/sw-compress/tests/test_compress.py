@@ -97,7 +97,7 @@ def test_a_size_out_of_reach_names_one_that_is_not(ball):
 
 
 def test_a_number_of_gaussians_keeps_the_most_significant(ball):
-    """Those that no camera shows go first."""
+    """Gaussians that no camera shows go first."""
     model = ball(60, degree=0)
     model.opacity_logits[:20] = -5.4  # drawn, and never more than a 1/255 of a pixel
     model.means[7], model.log_scales[7], model.opacity_logits[7] = torch.zeros(3), torch.full((3,), -0.7), 4.0

@@ -61,7 +61,7 @@ def test_the_file_of_a_training_fills_its_size(model, tmp_path: Path, method: st
 
 
 def test_training_views_say_what_may_go(ball):
-    """What they do not show goes first: these prove more than cameras that are made up."""
+    """Gaussians that training views do not show go first: these prove more than cameras that are made up."""
     model = ball(300)
     model.means[:100, 0] += 50.0
     found, codec = Sized(load_plugins(), size="2700").chosen(model, "3dgs", {}, Around())

@@ -122,9 +122,8 @@ def _there(folder: Path) -> Iterator[None]:
 def _format(asked: str | None, out: str | None) -> str:
     """Return the format asked for, or that of the name of the result. Raises UserInputError where they differ."""
     suffix = "" if out is None else Path(out).suffix.lower().removeprefix(".")
-    known = FORMATS
-    if suffix and suffix not in ((asked,) if asked else known):
-        which = asked or ", ".join(known)
+    if suffix and suffix not in ((asked,) if asked else FORMATS):
+        which = asked or ", ".join(FORMATS)
         raise UserInputError(f"{out}: a file of this name would hold {which}: give --out FILE.{asked or FORMATS[0]}")
     return asked or suffix or FORMATS[0]
 

@@ -60,7 +60,7 @@ def replayed(model, graphs=False):
 
 
 def step(model, **switches):
-    """What a step draws, and its gradients."""
+    """Values that a step draws, and their gradients."""
     for name, value in {"counted": 0.0, "jitters": False, "packets": None, **switches}.items():
         setattr(model, name, value)
     torch.manual_seed(3)

@@ -51,8 +51,8 @@ BASIS, PRECISION = "basis", "precision"
 """Sections of some files, before those whose meaning depends on them."""
 
 SMALLEST_PREFIX = 1 / 16
-"""The first of n packets holds this share of the Gaussians to the power 1 - 1/n, the first two to the power 1 - 2/n;
-usually."""
+"""The first of n packets holds this share of the Gaussians to the power 1 - 1/n, the first two to the power 1 - 2/n,
+if nothing else is said."""
 
 ROWS_AT_ONCE = 1 << 12
 """Rows that are dequantised together: intermediate doubles of all rows would outweigh the model several times."""
