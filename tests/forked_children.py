@@ -32,6 +32,7 @@ from types import ModuleType, SimpleNamespace
 from typing import IO, Any
 
 import splatwizard_core.runs.fresh
+from splatwizard_core.plugins import PluginManager, loading
 
 MODULES = (
     "splatwizard_core.cli.fresh_child", "splatwizard_core", "sw_bench.child", "sw_doctor.probe", "sw_doctor.imports",
@@ -293,6 +294,9 @@ class Imported:
                 importlib.import_module(name)
         if "sw_report.page" in sys.modules:
             sys.modules["sw_report.page"].page_template()  # compiling it is a quarter of a short run
+        with contextlib.suppress(Exception):  # a child looks itself; read metadata and parsed requirements are kept
+            PluginManager(loading.installed_entry_points("splatwizard"))
+        loading._installed_version.cache_clear()
         found = [name for name in sys.modules if name.startswith("sw_")]
         self._modules = {name: sys.modules.pop(name) for name in found}
 

@@ -27,12 +27,15 @@ def prints_to_stderr() -> AbstractContextManager[Any]:
 class GuardedHooks:
     """Stands for a plugin's module in pluggy: its hook implementations as attributes."""
 
+    def __dir__(self) -> list[str]:
+        return [*vars(self)]  # pluggy looks at each name
+
 
 def guarded_hooks(module: Any, manager: pluggy.PluginManager, guard: Guard) -> GuardedHooks:
     """The hook implementations of `module`, with their names and options, each call inside `guard`."""
     found = GuardedHooks()
     for name in dir(module):
-        options = manager.parse_hookimpl_opts(module, name)
+        options = None if name.startswith("__") else manager.parse_hookimpl_opts(module, name)
         if options is None:
             continue
         wraps = options.get("wrapper") or options.get("hookwrapper")

@@ -122,10 +122,10 @@ def unmet_requirement(dist: importlib.metadata.Distribution | None) -> str | Non
     """The first dependency of `dist` that is not installed, or not in a version that it takes, with the cure."""
     for text in _header(dist).get_all("Requires-Dist", []):
         try:
-            requirement = Requirement(text)
+            requirement, applies = _requirement(text)
         except InvalidRequirement:
             return f"its metadata requires {text[:80]!r}, which cannot be read: have its author mend `dependencies`"
-        if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
+        if not applies:
             continue
         name = superseded().get(normal_name(requirement.name), requirement.name)
         try:
@@ -152,7 +152,17 @@ def _header(dist: importlib.metadata.Distribution | None) -> Message:
     text = None
     with contextlib.suppress(UnicodeDecodeError, OSError):
         text = dist and (dist.read_text("METADATA") or dist.read_text("PKG-INFO"))
-    return HeaderParser().parsestr((text or "").partition("\n\n")[0])
+    return _parsed((text or "").partition("\n\n")[0])
+
+
+_parsed = functools.cache(HeaderParser().parsestr)  # each is asked for its name, its version and its requirements
+
+
+@functools.cache
+def _requirement(text: str) -> tuple[Requirement, bool]:
+    """A requirement, most of which many packages share, and whether it holds here and without extras."""
+    requirement = Requirement(text)
+    return requirement, requirement.marker is None or requirement.marker.evaluate({"extra": ""})
 
 
 @functools.cache
