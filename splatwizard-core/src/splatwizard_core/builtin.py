@@ -24,7 +24,6 @@ def register_commands(registry: Registry) -> None:
         ("decode", "codec:decode", "a file back to a model, from nothing but itself"),
         ("eval", "evaluate:evaluate", "quality, speed and memory of an encoded scene"),
         ("export", "export:export", ".ply and other interchange formats"),
-        ("info", "info:info", "what is in a file or scene"),
         ("list-plugins", "list_plugins:list_plugins", "what is installed, what is broken and why"),
         ("schedule", "schedule:schedule", "a method's plan as a table"),
     )):  # fmt: skip

@@ -16,6 +16,7 @@ from splatwizard_core.base.toml_file import read_toml as read_toml
 from splatwizard_core.base.values import parse_size as parse_size
 from splatwizard_core.cli.complete import COMPLETION_VARIABLE as COMPLETION_VARIABLE
 from splatwizard_core.cli.complete import SCENE as SCENE
+from splatwizard_core.cli.complete import SCENE_OR_FILE as SCENE_OR_FILE
 from splatwizard_core.cli.complete import name_of as name_of
 from splatwizard_core.cli.options import config_option as config_option
 from splatwizard_core.cli.options import console as console
@@ -41,10 +42,12 @@ from splatwizard_core.cli.paths import EXISTING as EXISTING
 from splatwizard_core.cli.paths import OUTPUT_FILE as OUTPUT_FILE
 from splatwizard_core.cli.paths import OUTPUT_FOLDER as OUTPUT_FOLDER
 from splatwizard_core.cli.paths import OUTPUT_PAGE as OUTPUT_PAGE
+from splatwizard_core.cli.paths import existing as existing
 from splatwizard_core.cli.paths import existing_file as existing_file
 from splatwizard_core.cli.setup import Choices as Choices
 from splatwizard_core.cli.setup import open_session as open_session
 from splatwizard_core.cli.setup import takes_choices as takes_choices
+from splatwizard_core.cli.streams import without_orders as without_orders
 from splatwizard_core.coding.cuts import Prefix as Prefix
 from splatwizard_core.coding.limits import decoded_limit as decoded_limit
 from splatwizard_core.errors import DiskFullError as DiskFullError
@@ -75,6 +78,8 @@ from splatwizard_core.runs.directory import OWN_FILES as OWN_FILES
 from splatwizard_core.runs.directory import RunRequest as RunRequest
 from splatwizard_core.runs.directory import run_directory as run_directory
 from splatwizard_core.runs.encode import encode as encode
+from splatwizard_core.runs.file_needs import missing_parts as missing_parts
+from splatwizard_core.runs.file_needs import missing_plugin as missing_plugin
 from splatwizard_core.runs.identity import recorded_hash as recorded_hash
 from splatwizard_core.runs.measure import open_subject as open_subject
 from splatwizard_core.runs.observers import FinishedRun as FinishedRun
@@ -94,6 +99,7 @@ from splatwizard_core.runs.run import run as run
 from splatwizard_core.runs.run import train_in as train_in
 from splatwizard_core.runs.session import Session as Session
 from splatwizard_core.runs.training import cached_directory as cached_directory
+from splatwizard_core.scene.loading import family_of as family_of
 from splatwizard_core.scene.loading import load_scene as load_scene
 from splatwizard_core.scene.locate import DATA_VARIABLE as DATA_VARIABLE
 from splatwizard_core.training.keys import block_keys as block_keys

@@ -2,7 +2,6 @@
 
 import importlib.abc
 import json
-import math
 import os
 import signal
 import subprocess
@@ -24,7 +23,7 @@ from splatwizard_core.runs import file_needs
 
 assert file_needs  # here, so that it does not keep the catalogue of a test that imports it first
 COMMANDS = (
-    "run", "train", "encode", "decode", "truncate", "eval", "export", "info", "list-plugins", "schedule",
+    "run", "train", "encode", "decode", "truncate", "eval", "export", "list-plugins", "schedule",
 )  # fmt: skip
 """Of the core."""
 
@@ -123,20 +122,11 @@ def test_a_run_that_no_package_reports_ends_in_a_line(tmp_path: Path, monkeypatc
         (["run", "--seed", "x"], "--seed"),
         (["run", "--method", "no-such-method"], "no method is called 'no-such-method'"),
         (["run", "--config", "/nowhere/config.toml"], "cannot read --config /nowhere/config.toml"),
-        (["info", "/nowhere/scene.swz"], "/nowhere/scene.swz: there is no such file"),
-        (["info", "/nowhere/at-all"], "/nowhere/at-all"),
         (["decode", "/nowhere/scene.swz"], "there is no such file"),
         (["eval", "/nowhere/scene.swz"], "there is no such file"),
         (["eval", "{text}", "--scene", "demo:tiny"], "not a .swz file"),
-        (["info", "{text}"], "{text}"),
         (["encode", "{text}"], "takes a run directory or a .ply"),
         (["export", "{text}", "x.ply"], "not a .swz file"),
-        (["info", "demo:tiny", "--set", "resolutoin=3"], "did you mean 'resolution'"),
-        (["info", "demo:tiny", "--set", "resolution"], "--set needs key=value"),
-        (["info", "demo:tiny", "--set", "iterations=3"], "of no use here"),
-        (["info", "demo:tiny", "--set", "principal_point=middle"], "expected one of center, file"),
-        (["info", "demo:tiny", "--set", "background=puce"], "expected one of black, white"),
-        (["info", ""], "PATH is empty"),
         (["run", "--scene", ""], "--scene is empty"),
         (["run", "--method", ""], "--method is empty"),
         (["run", "--scene", "demo:tiny", "--out", "{text}"], "cannot write into {text}: it is a file"),
@@ -281,46 +271,6 @@ def test_version(capsys: pytest.CaptureFixture[str]):
     assert capsys.readouterr().out.strip() == importlib.metadata.version("splatwizard-core")
 
 
-def test_info_of_a_scene_as_json(capsys: pytest.CaptureFixture[str]):
-    assert main(["info", "demo:tiny", "--set", "test_every=2", "--json"]) == 0
-    facts = json.loads(capsys.readouterr().out)
-    assert facts["kind"] == "scene"
-    assert facts["views"] == {"train": 4, "test": 4}
-
-
-def test_info_draws_a_split_from_above(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert main(["info", "demo:tiny", "--split", "block:0of4", "--json"]) == 0
-    facts = json.loads(capsys.readouterr().out)
-    assert (facts["views"], facts["pictures"]) == ({"train": 6, "test": 2}, ["demo-tiny-block-0of4.svg"])
-    assert facts["protocol"].endswith("/block:0of4/black/pp-center/q8/pts-train")
-    assert (tmp_path / "demo-tiny-block-0of4.svg").read_text().count("<path") == 8
-    assert main(["info", "demo:tiny", "--split", "block:0of4", "--set", "split=every2"]) == 2
-    assert "--split block:0of4 contradicts" in capsys.readouterr().err
-    assert main(["info", "demo:tiny"]) == 0
-    assert len(list(tmp_path.iterdir())) == 1  # nothing is drawn that was not asked for
-
-
-def test_info_of_a_file_lists_bytes_that_sum_to_its_size(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    from splatwizard_core.coding.container import ContainerWriter
-
-    writer = ContainerWriter("toy", 3, raster={"antialias": True})
-    writer.static["note"] = "[bold]not markup[/bold]"
-    writer.add("means", b"12345")
-    writer.add("sh", b"")
-    size = writer.write(tmp_path / "x.swz")
-    assert main(["info", str(tmp_path / "x.swz"), "--json"]) == 0
-    facts = json.loads(capsys.readouterr().out)
-    assert facts["kind"] == "file"
-    assert (facts["method"], facts["method_version"]) == ("toy", 3)
-    assert facts["bytes"]["means"] == 5
-    assert sum(facts["bytes"].values()) == facts["size"] == size
-    assert main(["info", str(tmp_path / "x.swz")]) == 0
-    text = capsys.readouterr().out
-    assert "[bold]not markup[/bold]" in text
-    assert f"{size:,}" in text
-
-
 def test_decoding_a_file_of_a_method_that_is_not_installed_says_what_to_install(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
@@ -336,9 +286,6 @@ def test_decoding_a_file_of_a_method_that_is_not_installed_says_what_to_install(
 
 
 def test_ply_files_are_measured_drawn_and_exported(tmp_path: Path, capsys: pytest.CaptureFixture[str], ply: Path):
-    assert main(["info", str(ply), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["num_gaussians"] == 40
-
     assert main(["export", str(ply), str(tmp_path / "again.ply"), "--json"]) == 0
     capsys.readouterr()
     assert (tmp_path / "again.ply").read_bytes() == ply.read_bytes()
@@ -356,23 +303,6 @@ def test_ply_files_are_measured_drawn_and_exported(tmp_path: Path, capsys: pytes
     from PIL import Image
 
     assert Image.open(tmp_path / "views" / "view_000.png").size == (64, 48)
-
-
-def test_info_counts_the_gaussians_of_a_ply_that_are_not_finite(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], ply: Path
-):
-    import struct
-
-    head, mark, body = ply.read_bytes().partition(b"end_header\n")
-    spoiled = tmp_path / "spoiled.ply"
-    spoiled.write_bytes(head + mark + struct.pack("<f", math.nan) + body[4:])  # x of the first one
-    assert main(["info", str(spoiled), "--json"]) == 0
-    facts = json.loads(capsys.readouterr().out)
-    assert (facts["num_gaussians"], facts["not_finite"], facts["zero_rotation"]) == (39, 1, 0)
-    assert all(-0.5 <= low <= high <= 0.5 for low, high in zip(facts["box"]["min"], facts["box"]["max"], strict=True))
-    spoiled.write_bytes(head.replace(b"vertex 40", b"vertex 0") + mark)
-    assert main(["info", str(spoiled), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["box"] is None
 
 
 @pytest.fixture

@@ -7,7 +7,6 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from splatwizard_core.cli.main import main
 from splatwizard_core.errors import SplatwizardError, UserInputError
 from splatwizard_core.runs.record import (
     Record,
@@ -78,16 +77,6 @@ def test_a_record_of_an_earlier_release_is_read_without_what_it_does_not_have(tm
     record = read_record(tmp_path / "metrics.json")
     assert (record.training_psnr, record.geometry) == (None, None)
     assert record.metrics["psnr"].mean == 30.0
-
-
-def test_info_shows_options_of_drawing_that_are_not_the_defaults(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    path = tmp_path / "metrics.json"
-    for options, told in (({}, False), ({"profile": "dgr-exact", "antialias": True}, True)):
-        Record.model_validate(content(raster_options={"train": {}, "render": options})).write(path)
-        assert main(["info", str(path)]) == 0
-        text = capsys.readouterr().out
-        assert ("raster options" in text) is told
-        assert ("render profile dgr-exact, antialias yes" in text) is told
 
 
 def test_every_null_has_its_reason():

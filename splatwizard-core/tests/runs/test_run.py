@@ -274,7 +274,6 @@ def test_encode_of_a_directory_with_another_codec(done, tmp_path: Path, capsys: 
     assert by_rate["sha256"] == low.file.sha256
     assert main(["encode", directory, "--rate", "r9"]) == 2
     assert "no rate point 'r9'" in capsys.readouterr().err
-    assert said_by(["info", directory], capsys)["kind"] == "file"
     assert main(["decode", directory]) == 2
     assert "the file in it is" in capsys.readouterr().err
     assert main(["encode", directory, "--set", "iterations=9"]) == 2

@@ -265,7 +265,7 @@ def test_a_pipe_is_told_as_such(toy_plugins, tmp_path, capsys):
     with pytest.raises(UserInputError, match=f"init: .*x.ply: {told}"):
         check_model(str(pipes[0]))
     training = ["train", "--method", "toy-student", "--out", str(tmp_path), "--set", "init_points=3", "--init"]
-    for words in (["info"], ["eval", "--scene", "demo:tiny"], ["decode", "--out", str(tmp_path / "y")], ["encode"],
+    for words in (["eval", "--scene", "demo:tiny"], ["decode", "--out", str(tmp_path / "y")], ["encode"],
                   training, [*training[:-1], "--scene"]):  # fmt: skip
         for pipe in pipes:
             assert main([*words, str(pipe)]) == 2

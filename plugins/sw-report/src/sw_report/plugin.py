@@ -1,4 +1,4 @@
-"""Registers `sw report` and `sw compare`, makes the tables and pages that `sw run` ends with, logs to TensorBoard."""
+"""Registers `sw report`, `sw compare`, `sw info`; makes what `sw run` ends with; logs to TensorBoard."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ def register_commands(registry: Registry) -> None:
     registry.add(
         "compare", "sw_report.compare:compare", position=4.8, summary="two files; a run beside published figures"
     )
+    registry.add("info", "sw_report.info:info", position=5.5, summary="what is in a file or scene")
 
 
 @hookimpl

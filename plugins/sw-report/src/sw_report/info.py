@@ -8,25 +8,34 @@ from typing import Any
 
 import click
 
-from splatwizard_core.base.files import write_atomic
-from splatwizard_core.cli import options as shared
-from splatwizard_core.cli.complete import SCENE_OR_FILE
-from splatwizard_core.cli.paths import existing
-from splatwizard_core.cli.setup import Choices, takes_choices
-from splatwizard_core.cli.streams import without_orders
-from splatwizard_core.errors import UserInputError
-from splatwizard_core.plugins import load_plugins
+from splatwizard_core.api import ContainerReader, UserInputError
+from splatwizard_core.tooling import (
+    SCENE_OR_FILE,
+    Choices,
+    debug_option,
+    existing,
+    images_option,
+    json_option,
+    load_plugins,
+    options,
+    print_facts,
+    print_table,
+    set_option,
+    takes_choices,
+    without_orders,
+    write_atomic,
+)
 
 
 @click.command(short_help="what is in a file or scene")
 @click.argument("path", metavar="PATH", type=SCENE_OR_FILE)
 @click.option("--split", metavar="RULE", help="Split a scene by this rule, and draw it as .svg.  [default: no picture]")
-@shared.options(shared.images_option, shared.set_option, shared.json_option, shared.debug_option)
+@options(images_option, set_option, json_option, debug_option)
 @takes_choices
 def info(path: str, as_json: bool, chosen: Choices) -> None:
     """Show what is in PATH: a .swz file (bytes by section), a run directory (its file), a metrics.json (scores, and who
     served which phase), a .ply, or a scene (a folder, dataset/scene, or one that is made on the spot, by its name)."""
-    from splatwizard_core.scene.loading import family_of
+    from splatwizard_core.tooling import family_of
 
     if not path.strip():
         raise click.UsageError("PATH is empty")
@@ -45,7 +54,7 @@ def info(path: str, as_json: bool, chosen: Choices) -> None:
         raise UserInputError(f"{path}: no file that `sw info` can read: .swz, metrics.json, {', '.join(kinds)}")
     else:
         kind, facts = "scene", _scene_facts(path, chosen)
-    shared.print_facts({"kind": kind, **facts}, as_json, show)
+    print_facts({"kind": kind, **facts}, as_json, show)
 
 
 def _holds_gaussians(text: bytes) -> bool:
@@ -63,8 +72,7 @@ def _head(path: Path, count: int = -1) -> bytes:
 
 def _file_facts(path: Path) -> dict[str, Any]:
     """Header and bytes by section of a .swz, which sum to its size; and what is missing here to decode it, and why."""
-    from splatwizard_core.coding.container import ContainerReader
-    from splatwizard_core.runs.file_needs import missing_parts, missing_plugin
+    from splatwizard_core.tooling import missing_parts, missing_plugin
 
     reader, plugins = ContainerReader.open(path), load_plugins()
     missing = {f"{kind} {name}": str(missing_plugin(reader, plugins, kind, name))
@@ -74,7 +82,7 @@ def _file_facts(path: Path) -> dict[str, Any]:
 
 def _record_facts(path: Path) -> dict[str, Any]:
     """The gist of a result record: what was run, its scores, and who served which phase."""
-    from splatwizard_core.runs.record import read_record
+    from splatwizard_core.tooling import read_record
 
     record = read_record(path).model_dump(mode="json")
     means = {name: metric["mean"] for name, metric in record["metrics"].items() if not metric["diagnostic"]}
@@ -95,7 +103,7 @@ def _part(facts: dict[str, Any], *names: str) -> dict[str, Any]:
 
 
 def _gaussian_facts(path: Path) -> dict[str, Any]:
-    from splatwizard_core.runs.decode import read_gaussians
+    from splatwizard_core.tooling import read_gaussians
 
     model = read_gaussians(existing(path), load_plugins())
     means, scales, opacities = model.means.detach(), model.scales.detach(), model.opacities.detach()
@@ -115,7 +123,7 @@ def _gaussian_facts(path: Path) -> dict[str, Any]:
 
 
 def _scene_facts(spec: str, chosen: Choices) -> dict[str, Any]:
-    from splatwizard_core.scene.loading import load_scene
+    from splatwizard_core.tooling import load_scene
 
     plugins = load_plugins()
     scene = load_scene(spec, chosen.resolve_without_method().scene, plugins)
@@ -133,13 +141,13 @@ def _print_file(facts: dict[str, Any]) -> None:
     sections = [[name, f"{n:,}", f"{n / facts['size']:.1%}"] for name, n in facts["bytes"].items()]
     click.echo(without_orders("\n".join(lines)))
     total = ["file", f"{facts['size']:,}", "100.0%"]
-    shared.print_table(["section", "bytes", "share"], [*sections, [], total], right=2)
+    print_table(["section", "bytes", "share"], [*sections, [], total], right=2)
     if facts["cuts"]:
         rows = [
             [f"{cut['packets']}", f"{cut['bytes']:,}", "-" if cut["psnr"] is None else f"{cut['psnr']:.2f}"]
             for cut in facts["cuts"]
         ]
-        shared.print_table(["packets", "bytes", "PSNR of the training views, dB"], rows, right=3)
+        print_table(["packets", "bytes", "PSNR of the training views, dB"], rows, right=3)
     if facts["packets"] < len(facts["cuts"]):
         click.echo(f"the file ends after packet {facts['packets']} of {len(facts['cuts'])}")
     for reason in facts["missing"].values():
@@ -161,7 +169,7 @@ def _print_record(facts: dict[str, Any]) -> None:
         for i, (owner, parts) in enumerate((served or {"": ["-"]}).items()):
             rows.append(["" if i else phase["phase"], ", ".join(parts), owner])
         rows.append([])
-    shared.print_table(["phase", "provided by", "from"], rows)
+    print_table(["phase", "provided by", "from"], rows)
 
 
 def _started_from(pretraining: dict[str, dict[str, Any]]) -> str:
@@ -177,7 +185,7 @@ def _started_from(pretraining: dict[str, dict[str, Any]]) -> str:
 
 def _print_plain(facts: dict[str, Any]) -> None:
     known = {name: value for name, value in facts.items() if name != "kind" and value not in (None, "", [], {})}
-    shared.print_table([], [[name.replace("_", " "), _shown(value)] for name, value in known.items()])
+    print_table([], [[name.replace("_", " "), _shown(value)] for name, value in known.items()])
 
 
 def _shown(value: Any) -> str:
