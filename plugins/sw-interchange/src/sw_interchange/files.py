@@ -21,7 +21,7 @@ from sw_interchange.source import Source
 
 NO_LIMITS = Limits()
 FOLDER = "sog-folder"
-KEEPS_SURFELS = ("ply", "sog", FOLDER)
+KEEPS_SURFELS = ("ply", "sog", FOLDER, "usda", "usdc", "usdz")
 
 
 def read(

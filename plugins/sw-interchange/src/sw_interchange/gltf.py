@@ -6,9 +6,7 @@ Source: the text of the extension in KhronosGroup/glTF.
 from __future__ import annotations
 
 import json
-import math
 import struct
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,9 +14,9 @@ import numpy.typing as npt
 
 from splatwizard_core.api import BitstreamError, UserInputError
 from sw_interchange.bands import COEFFICIENTS, Array
-from sw_interchange.frames import transformed
+from sw_interchange.frames import placed
 from sw_interchange.gltf_writer import EXTENSION
-from sw_interchange.scene import FLAT, LARGEST_LOGIT, GaussianScene, Limits, ReadReport, decoded_bytes
+from sw_interchange.scene import FLAT, LARGEST_LOGIT, GaussianScene, Limits, ReadReport, decoded_bytes, joined
 from sw_interchange.source import Source, json_reason
 
 MAX_JSON = 1 << 24
@@ -120,11 +118,7 @@ def read_gltf(source: Source, limits: Limits, report: ReadReport) -> GaussianSce
     parts = [_primitive(document, each, place, report) for each, place in _placed(document)]
     if not parts:
         raise document.error(f"there are no splats in it: nothing uses {EXTENSION}")
-    k = COEFFICIENTS[max(each.sh_degree for each in parts)]
-    rest = [np.pad(each.sh_rest, ((0, 0), (0, k - each.sh_rest.shape[1]), (0, 0))) for each in parts]
-    names = ("means", "log_scales", "quats", "opacity_logits", "sh_dc")
-    joined = {name: np.concatenate([getattr(each, name) for each in parts]) for name in names}
-    return replace(parts[0], **joined, sh_rest=np.concatenate(rest))
+    return joined(parts)
 
 
 def _placed(document: _Document) -> list[tuple[dict[str, Any], Matrix]]:
@@ -225,14 +219,8 @@ def _primitive(document: _Document, primitive: dict[str, Any], place: Matrix, re
 
 
 def _moved(document: _Document, scene: GaussianScene, place: Matrix) -> GaussianScene:
-    if np.array_equal(place, np.eye(4)):
-        return scene
-    volume = np.linalg.det(place[:3, :3])
-    if volume < 0:
-        raise document.error("a node mirrors its splats, which is not read: its scale is negative")
-    scale = math.pow(volume, 1 / 3) or 1.0
     try:
         with np.errstate(all="ignore"):
-            return transformed(scene, place[:3, :3] / scale, scale, place[:3, 3])
+            return placed(scene, place)
     except UserInputError as error:
         raise document.error(f"a node moves its splats in a way that is not read: {error}") from error

@@ -74,6 +74,12 @@ _FORMATS = (
     Format("ksplat", ".ksplat", "buckets of quantised Gaussians (mkkellogg)", 2, reader="ksplat:read_ksplat"),
     Format("gltf", ".glb", "binary glTF with KHR_gaussian_splatting, float32", 3, frame="LUF",
            reader="gltf:read_gltf", writer="gltf_writer:write_gltf", options="gltf_writer:GltfOptions"),
+    Format("usda", ".usda", "OpenUSD as text: a prim ParticleField3DGaussianSplat", 4, frame="RUB",
+           reader="usd:read_usd", writer="usd_writer:write_usda", options="usd_writer:UsdOptions"),
+    Format("usdc", ".usdc", "OpenUSD as crate, float32", 4, frame="RUB", reader="usd:read_usd",
+           writer="usd_writer:write_usdc", options="usd_writer:UsdOptions"),
+    Format("usdz", ".usdz", "OpenUSD as archive of a crate", 4, frame="RUB", reader="usd:read_usd",
+           writer="usd_writer:write_usdz", options="usd_writer:UsdOptions"),
     Format("checkpoint", ".pt", "PyTorch checkpoints of gsplat, nerfstudio and 3DGS", 4,
            reader="checkpoint:read_checkpoint"),
 )  # fmt: skip
@@ -114,6 +120,8 @@ def detect(source: Source) -> Format:
         return format_named(_kind_of_archive(source))
     if head[:4] == b"glTF":
         return format_named("gltf")
+    if head[:7] == b"#usda 1" or head[:8] == b"PXR-USDC":
+        return format_named("usda" if head[:1] == b"#" else "usdc")
     if head[:4] == b"RAD0":
         return format_named("rad")
     if name.endswith(".lcc"):
@@ -125,8 +133,6 @@ def detect(source: Source) -> Format:
     for suffix, found in ((".splat", "splat"), (".ksplat", "ksplat")):
         if name.endswith(suffix):
             return format_named(found)
-    if head[:7] == b"#usda 1" or head[:8] == b"PXR-USDC":
-        raise BitstreamError(f"{source.name}: USD is not read: export the scene as .ply where it was made")
     raise BitstreamError(f"{source.name}: neither its first bytes nor its suffix is that of a format with Gaussians")
 
 
@@ -148,12 +154,12 @@ def _is_something_else(source: Source) -> bool:
 
 
 def _kind_of_archive(source: Source) -> str:
-    """SOG bundle or torch checkpoint: both are ZIP archives."""
+    """SOG bundle, torch checkpoint or usdz: all are ZIP archives."""
     from sw_interchange.archive import entries_of
 
     names = [entry.filename for entry in entries_of(source)]
     if any(name.endswith("/data.pkl") for name in names):
         return "checkpoint"
     if any(name.lower().endswith((".usd", ".usda", ".usdc")) for name in names):
-        raise BitstreamError(f"{source.name}: USD is not read: export the scene as .ply where it was made")
+        return "usdz"
     return "sog"
