@@ -15,9 +15,10 @@ import numpy.typing as npt
 from splatwizard_core.api import BitstreamError, UserInputError
 from sw_interchange.bands import COEFFICIENTS, Array
 from sw_interchange.frames import placed
-from sw_interchange.gltf_writer import EXTENSION
+from sw_interchange.gltf_writer import EXTENSION, SPZ
 from sw_interchange.scene import FLAT, LARGEST_LOGIT, GaussianScene, Limits, ReadReport, decoded_bytes, joined
 from sw_interchange.source import Source, json_reason
+from sw_interchange.spz import read_spz
 
 MAX_JSON = 1 << 24
 MAX_NODES = 1 << 16
@@ -74,6 +75,23 @@ class _Document:
             raise self.error(f"'{key}' is {found!r:.20}, which is no size")
         return found
 
+    def view(self, index: Any) -> dict[str, Any]:
+        """A part of the second chunk."""
+        view = self.item("bufferViews", index)
+        buffer = self.item("buffers", view.get("buffer"))
+        if view["buffer"] != 0 or "uri" in buffer:
+            raise self.error("its numbers lie in another file, which is not opened")
+        return view
+
+    def bytes_of(self, index: Any) -> memoryview:
+        """All bytes of a view."""
+        view = self.view(index)
+        start, length = self.whole(view, "byteOffset", 0), self.whole(view, "byteLength")
+        self.read += length
+        if start + length > len(self.blob) or self.read > MOST_READ * len(self.blob):
+            raise self.error("a view reaches beyond its buffer, or is read too often")
+        return self.blob[start : start + length]
+
     def column(self, index: Any) -> Array:
         """[N,width] float32 of an accessor; normalised integers become what they stand for."""
         accessor = self.item("accessors", index)
@@ -83,10 +101,7 @@ class _Document:
         )
         if component is None or width is None or "sparse" in accessor:
             raise self.error(f"accessor {index} has a type, or a sparse form, that splats do not have")
-        view = self.item("bufferViews", accessor.get("bufferView"))
-        buffer = self.item("buffers", view.get("buffer"))
-        if view["buffer"] != 0 or "uri" in buffer:
-            raise self.error("its numbers lie in another file, which is not opened")
+        view = self.view(accessor.get("bufferView"))
         row = np.dtype((component, (width,)))
         count, stride = self.whole(accessor, "count"), self.whole(view, "byteStride", 0) or row.itemsize
         self.rows += count
@@ -186,6 +201,8 @@ def _primitive(document: _Document, primitive: dict[str, Any], place: Matrix, re
     extension = primitive["extensions"][EXTENSION]
     if isinstance(extension, dict) and extension.get("colorSpace") == "lin_rec709_display":
         report.warnings.append("its colours are linear, and are taken as they are: they will look too dark")
+    if isinstance(extension, dict) and isinstance(packed := extension.get("extensions"), dict) and packed:
+        return _moved(document, _unpacked(document, packed, report), place)
     attributes = primitive.get("attributes")
     if not isinstance(attributes, dict):
         raise document.error("a primitive without attributes")
@@ -216,6 +233,20 @@ def _primitive(document: _Document, primitive: dict[str, Any], place: Matrix, re
         column(f"{EXTENSION}:SH_DEGREE_0_COEF_0", 3, n), rest, frame="LUF",
     )  # fmt: skip
     return _moved(document, scene, place)
+
+
+def _unpacked(document: _Document, packed: dict[str, Any], report: ReadReport) -> GaussianScene:
+    """The splats of a primitive that are compressed in a way of an extension of the extension."""
+    found = packed.get(SPZ)
+    if not isinstance(found, dict):
+        names = ", ".join(f"{name:.60}" for name in sorted(packed)[:3])
+        raise document.error(f"its splats are compressed by {names}, which is not read; {SPZ} is")
+    source = Source(document.bytes_of(found.get("bufferView")), f"{document.name}/spz")
+    scene = read_spz(source, document.limits, report)
+    document.rows += scene.num_gaussians
+    document.limits.check(document.rows, decoded_bytes(document.rows, 15), document.size, document.name)
+    report.version = "2.0"
+    return scene.in_frame("LUF")
 
 
 def _moved(document: _Document, scene: GaussianScene, place: Matrix) -> GaussianScene:

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from sw_gaussians.ply_tables import BOM
+
 from splatwizard_core.api import BitstreamError, UserInputError
 from sw_interchange.source import Source
 from sw_interchange.spz_packing import inflate
@@ -57,6 +59,7 @@ class Format:
 
 _FORMATS = (
     Format("ply", ".ply", "3DGS .ply in all its dialects, float32", 4, reader="ply:read_ply", writer="ply:write_ply"),
+    Format("zipped-ply", ".zip", "a .ply in a ZIP archive, as Luma gives it", 4, reader="ply:read_zipped_ply"),
     Format("splat", ".splat", "32 bytes per Gaussian, no SH", 0, reader="splat:read_splat", writer="splat:write_splat",
            options="splat:SplatOptions"),
     Format("spz", ".spz", "quantised and compressed, SH included (Niantic)", 4, reader="spz:read_spz",
@@ -112,7 +115,7 @@ def detect(source: Source) -> Format:
     head, name = source.head(1 << 12), source.name.lower()
     if name.endswith(".splat") and not len(source.data) % 32 and not _is_something_else(source):
         return format_named("splat")
-    if head[:4] in (b"ply\n", b"ply\r"):
+    if head.removeprefix(BOM)[:4] in (b"ply\n", b"ply\r"):
         return format_named("compressed-ply" if b"packed_position" in head else "ply")
     if head[:4] == b"NGSP" or head[:2] == b"\x1f\x8b":
         return format_named("spz")
@@ -154,12 +157,14 @@ def _is_something_else(source: Source) -> bool:
 
 
 def _kind_of_archive(source: Source) -> str:
-    """SOG bundle, torch checkpoint or usdz: all are ZIP archives."""
-    from sw_interchange.archive import entries_of
+    """SOG bundle, torch checkpoint, usdz or a .ply: all are ZIP archives."""
+    from sw_interchange.archive import entries_of, is_one_ply
 
     names = [entry.filename for entry in entries_of(source)]
     if any(name.endswith("/data.pkl") for name in names):
         return "checkpoint"
     if any(name.lower().endswith((".usd", ".usda", ".usdc")) for name in names):
         return "usdz"
+    if is_one_ply(names):
+        return "zipped-ply"
     return "sog"

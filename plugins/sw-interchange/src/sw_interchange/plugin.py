@@ -29,6 +29,8 @@ def register_exporters(registry: Registry) -> None:
 
 @hookimpl
 def register_importers(registry: Registry) -> None:
+    registry.add("zipped-ply", "sw_interchange.registered:import_zipped_ply", suffix=".zip",
+                 summary="a .ply in a ZIP archive, as Luma gives it")  # fmt: skip
     registry.add("splat", "sw_interchange.registered:import_splat", suffix=".splat",
                  summary=".splat: 32 bytes per Gaussian, no SH")  # fmt: skip
     registry.add("spz", "sw_interchange.registered:import_spz", suffix=".spz",

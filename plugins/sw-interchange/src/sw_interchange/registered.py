@@ -73,6 +73,7 @@ def notices(report: ReadReport) -> list[str]:
     return found
 
 
+import_zipped_ply = _importer("zipped-ply")
 import_splat, export_splat = _importer("splat"), _exporter("splat")
 import_spz, export_spz, export_spz4 = _importer("spz"), _exporter("spz"), _exporter("spz", version=4)
 import_sog, export_sog = _importer("sog"), _exporter("sog")
