@@ -55,11 +55,15 @@ test-browser: $(VENV)/.ready-dev
 test-interchange: $(VENV)/.ready-dev
 	npm install --silent --prefix build/oracle @playcanvas/splat-transform@3.7.0 @sparkjsdev/spark@2.2.0 three@0.180.0
 	test -d build/oracle/venv || $(PYTHON) -m venv build/oracle/venv
-	build/oracle/venv/bin/pip install -q gsply==0.4.6
+	build/oracle/venv/bin/pip install -q gsply==0.4.6 pygltflib==1.16.5
+	$(PIP) install -q -c constraints.txt -e 'plugins/sw-interchange[usd]' --no-build-isolation
+	test -d build/oracle/usd || $(PYTHON) -m venv build/oracle/usd
+	build/oracle/usd/bin/pip install -q 'usd-convert-gsplat[usd]==0.1.15'
 	SPLAT_TRANSFORM=build/oracle/node_modules/.bin/splat-transform GSPLY_PYTHON=build/oracle/venv/bin/python \
-	SPARK_MODULES=build/oracle/node_modules \
+	SPARK_MODULES=build/oracle/node_modules USD_CONVERT_PYTHON=build/oracle/usd/bin/python \
 		$(BIN)/python -m pytest -m '' plugins/sw-interchange/tests/test_other_programs.py \
 		plugins/sw-interchange/tests/test_lcc.py plugins/sw-interchange/tests/test_spark.py \
+		plugins/sw-interchange/tests/test_usd.py plugins/sw-interchange/tests/test_gltf.py \
 		plugins/sw-lod/tests/test_splat_transform.py $(PYTEST_ARGS)
 
 test-wheels: $(VENV)/.ready-dev

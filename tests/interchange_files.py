@@ -34,6 +34,18 @@ def random_scene(n: int, degree: int, seed: int = 0) -> GaussianScene:
     )
 
 
+def covariances(scene: GaussianScene) -> np.ndarray:
+    """[N,3,3] over their largest entry: quaternions of the same ellipsoid may differ by a half turn."""
+    w, x, y, z = scene.quats.T.astype(np.float64)
+    rotation = np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]).transpose(2, 0, 1)  # fmt: skip
+    half = rotation * np.exp(scene.log_scales.astype(np.float64))[:, None]
+    return half @ half.transpose(0, 2, 1)
+
+
 def ksplat_file(n: int, level: int, degree: int, seed: int = 0) -> bytes:
     """A .ksplat of random records: two full buckets of n and a partial one of n // 2."""
     rng = np.random.default_rng(seed)

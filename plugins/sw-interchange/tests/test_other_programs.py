@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from interchange_files import random_scene
+from interchange_files import covariances, random_scene
 from scipy.spatial import cKDTree
 from sw_interchange import GaussianScene, read, write
 from sw_interchange.scene import sigmoid
@@ -42,18 +42,6 @@ def by_gsply(source: Path, target: Path) -> None:
     assert GSPLY is not None
     command = [GSPLY, "-c", GSPLY_PROGRAM, str(source), str(target)]
     subprocess.run(command, check=True, capture_output=True, timeout=300)
-
-
-def covariances(scene: GaussianScene) -> np.ndarray:
-    """[N,3,3] over their largest entry: quaternions of the same ellipsoid may differ by a half turn."""
-    w, x, y, z = scene.quats.T.astype(np.float64)
-    rotation = np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]).transpose(2, 0, 1)  # fmt: skip
-    half = rotation * np.exp(scene.log_scales.astype(np.float64))[:, None]
-    return half @ half.transpose(0, 2, 1)
 
 
 def check(scene: GaussianScene, found: GaussianScene, **bounds: float) -> None:

@@ -15,6 +15,7 @@ from sw_lod.command import lod
 from sw_lod.tree import build_tree, leaves_of
 
 from splatwizard_core.api import UserInputError
+from splatwizard_core.cli.main import main
 
 
 @pytest.fixture(scope="module")
@@ -113,3 +114,21 @@ def test_a_size_of_pieces_that_makes_no_sense_is_refused(tmp_path, chunk):
     found = CliRunner().invoke(lod, [str(file), "--out", str(tmp_path / "lod-meta.json"), "--chunk", chunk])
     assert found.exit_code != 0
     assert not (tmp_path / "lod-meta.json").exists()
+
+
+def test_the_command_counts_in_words_and_sw_info_reads_the_folder(written, tmp_path, capsys):
+    source, folder = written[0].parent, tmp_path / "new"
+    assert main(["lod", str(source / "lod-meta.json"), "--out", str(folder / "lod-meta.json"), "--levels", "1"]) == 0
+    assert "1 level (1,200 Gaussians) in 1 piece, 1 unit of" in capsys.readouterr().out
+    assert main(["info", str(folder), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["num_gaussians"] == 1200
+
+
+def test_an_interrupt_leaves_no_folder(model, tmp_path):
+    def interrupt(line: str) -> None:
+        if line.startswith("0_0"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_lod(model, tmp_path / "new" / "lod-meta.json", levels=2, chunk=400, device="cpu", say=interrupt)
+    assert not (tmp_path / "new").exists()

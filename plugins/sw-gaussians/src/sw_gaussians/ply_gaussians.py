@@ -76,11 +76,14 @@ def property_names(sh_rest: int, scales: int = 3) -> list[str]:
     ]  # fmt: skip
 
 
-def parse_gaussians(data: bytes | memoryview, path: str, *, max_gaussians: int | None = None) -> PlyGaussians:
+def parse_gaussians(
+    data: bytes | memoryview, path: str, *, max_gaussians: int | None = None, interleaved: bool = False
+) -> PlyGaussians:
     """Read the Gaussians of a .ply of any dialect. Raises BitstreamError if it is damaged, SceneError if it has none.
 
-    data    the whole file
-    path    what errors call it
+    data            the whole file
+    path            what errors call it
+    interleaved     f_rest begins with red, green and blue of the first coefficient, as some converters write it
     """
     name = Path(path).name
     header = read_header(bytes(data[:MAX_HEADER]), len(data), name)
@@ -89,16 +92,17 @@ def parse_gaussians(data: bytes | memoryview, path: str, *, max_gaussians: int |
         raise SceneError(f"{name}: {header.count('vertex'):,} Gaussians, more than {max_gaussians:,}", path=path)
     vertex = read_tables(data, header, ("vertex",), name)["vertex"]
     names = set(vertex.dtype.names or ())
-    shape = (len(vertex), 3, rest // 3)
     # f_rest is channel-major: all K-1 coefficients of red, then green, then blue.
-    channels = _columns(vertex, [f"f_rest_{i}" for i in range(rest)]).reshape(shape)
+    order = np.arange(rest).reshape((-1, 3) if interleaved else (3, -1))
+    columns = order.T.ravel() if interleaved else order.ravel()
+    channels = _columns(vertex, [f"f_rest_{i}" for i in columns]).reshape(len(vertex), 3, rest // 3)
     log_scales = _contiguous(_columns(vertex, [f"scale_{i}" for i in range(2 if flat else 3)]))
-    opacity_logits = _contiguous(_columns(vertex, ["opacity"]))[:, 0]
-    notes = []
+    opacity_logits, notes = _opacities(vertex), []
     if "filter_3D" in names:
         log_scales, opacity_logits = _bake(log_scales, opacity_logits, _columns(vertex, ["filter_3D"]))
         notes.append("the 3D filter of Mip-Splatting is part of scales and opacities now")
-    known = {*property_names(rest // 3), "filter_3D", *([] if "f_dc_0" in names else ["red", "green", "blue"])}
+    known = {*property_names(rest // 3), "filter_3D", *([] if "f_dc_0" in names else ["red", "green", "blue"]),
+             *([] if "opacity" in names else ["alpha"])}  # fmt: skip
     mode = _render_mode(header.comments)
     if any(comment.lower().startswith("vertical axis: z") for comment in header.comments):
         notes.append("its world is that of nerfstudio (z up, re-scaled), not that of the photographs")
@@ -173,7 +177,13 @@ def _check_dialect(header: PlyHeader, name: str, path: str) -> tuple[int, bool]:
         raise refuse("not a 3DGS model: the header names no element 'vertex'")
     if "x" in names and not names & {"opacity", "scale_0", "rot_0"}:
         found = "a mesh" if header.count("face") else "a point cloud"
-        raise refuse(f"{found}, not a 3DGS model: there is no opacity, scale or rotation")
+        raise refuse(
+            f"{found}, not a 3DGS model: there is no opacity, scale or rotation (trainers keep an input.ply of points "
+            "beside their models)"
+        )
+    moving = sorted(n for n in names if n in ("t", "trbf_center") or n.startswith("motion_"))
+    if moving:
+        raise refuse(f"Gaussians that move with time ('{moving[0]}'), which are not read: export one moment")
     rest = sum(1 for each in names if re.fullmatch(r"f_rest_\d+", each))
     degree = math.isqrt(rest // 3 + 1) - 1
     if rest % 3 or (degree + 1) ** 2 != rest // 3 + 1 or degree > 4:
@@ -182,10 +192,23 @@ def _check_dialect(header: PlyHeader, name: str, path: str) -> tuple[int, bool]:
     needed = [n for n in property_names(rest // 3, 2 if flat else 3) if n not in ("nx", "ny", "nz")]
     if "f_dc_0" not in names and {"red", "green", "blue"} <= names:
         needed = [n for n in needed if not n.startswith("f_dc")]
+    if "alpha" in names:
+        needed.remove("opacity")
     missing = [each for each in needed if each not in names]
     if missing:
         raise refuse(f"not a 3DGS model, property '{missing[0]}' is missing ({len(missing)} in all)")
     return rest, flat
+
+
+def _opacities(vertex: Table) -> Array:
+    """Logits [N], from `alpha` where there are none: 0..1, or a share of the largest whole number."""
+    if "opacity" in (vertex.dtype.names or ()):
+        return _contiguous(_columns(vertex, ["opacity"]))[:, 0]
+    alphas = _columns(vertex, ["alpha"])[:, 0].astype(np.float64)
+    if vertex.dtype["alpha"].kind != "f":
+        alphas /= np.iinfo(vertex.dtype["alpha"]).max
+    alphas = np.clip(alphas, 1e-6, 1 - 1e-6)
+    return (np.log(alphas) - np.log1p(-alphas)).astype(np.float32)
 
 
 def _colours(vertex: Table) -> Array:

@@ -16,6 +16,8 @@ from plyfile import PlyData
 
 from splatwizard_core.api import BitstreamError
 
+BOM = b"\xef\xbb\xbf"
+"""Mark of UTF-8 that some editors put before a text."""
 MAX_HEADER = 1 << 17
 MAX_LIST_ROWS = 1 << 20
 """Largest number of rows with lists, which are parsed one by one."""
@@ -82,7 +84,7 @@ def read_header(head: bytes, size: int, name: str) -> PlyHeader:
     Raises BitstreamError.
     """
     match = re.search(rb"[\r\n]end_header(\r\n|\n|\r)", head)
-    if not head.startswith(b"ply") or match is None:
+    if not head.removeprefix(BOM).startswith(b"ply") or match is None:
         raise BitstreamError(f"{name}: not a .ply file: no header within {MAX_HEADER} bytes", section="header")
     elements: list[_Element] = []
     named: set[str] = set()
@@ -102,7 +104,7 @@ def read_header(head: bytes, size: int, name: str) -> PlyHeader:
         elif words[:1] == ["property"] and elements:
             _add_property(elements[-1], words, f"{name}: property '{line[:60]}'")
         elif words[:1] in (["comment"], ["obj_info"]):
-            comments.append(line.partition(" ")[2].strip())
+            comments.append(" ".join(line.split(None, 1)[1:]).strip())
         elif words:
             raise BitstreamError(f"{name}: bad header line '{line[:60]}'", section="header")
     if order is None:
@@ -155,7 +157,7 @@ def read_tables(data: bytes | memoryview, header: PlyHeader, wanted: tuple[str, 
 
 def _by_plyfile(data: bytes | memoryview, header: PlyHeader, wanted: tuple[str, ...], name: str) -> Mapping[str, Table]:
     try:
-        parsed = PlyData.read(io.BytesIO(data))
+        parsed = PlyData.read(io.BytesIO(bytes(data).removeprefix(BOM)))
         found = {each.name: each.data for each in parsed.elements if each.name in wanted}
     except Exception as error:  # plyfile raises many kinds for damaged files, MemoryError and IndexError among them
         reason = " ".join(str(error).split()) or type(error).__name__

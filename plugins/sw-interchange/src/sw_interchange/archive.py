@@ -16,6 +16,13 @@ def entries_of(source: Source) -> list[zipfile.ZipInfo]:
     return _opened(source).infolist()
 
 
+def is_one_ply(names: list[str]) -> bool:
+    """Whether an archive of these files holds one .ply and no pictures."""
+    return sum(name.lower().endswith(".ply") for name in names) == 1 and not any(
+        name.lower().endswith(".webp") for name in names
+    )
+
+
 def read_entry(source: Source, info: zipfile.ZipInfo) -> bytes:
     """Return the content of one entry, no more bytes than it claims. Raises BitstreamError."""
     try:

@@ -21,7 +21,7 @@ from sw_interchange.source import Source
 
 NO_LIMITS = Limits()
 FOLDER = "sog-folder"
-KEEPS_SURFELS = ("ply", "sog", FOLDER)
+KEEPS_SURFELS = ("ply", "sog", FOLDER, "usda", "usdc", "usdz")
 
 
 def read(
@@ -33,6 +33,7 @@ def read(
     strict: bool = False,
     spz_frame: str = "RUB",
     level: int = 0,
+    sh_layout: str = "planar",
     undo_dataparser: str | os.PathLike[str] | None = None,
 ) -> GaussianScene:
     """Read a file; `scene.report` says what was found and mended.
@@ -42,6 +43,8 @@ def read(
     strict          raise where rows hold what is no number, instead of dropping them
     spz_frame       axes of .spz files that do not say: "RUB" as the format's text has it, "raw" for RDF
     level           of a scene of several levels of detail, 0 the finest
+    sh_layout       of a .ply: "planar" as 3DGS has it, "interleaved" where red, green and blue of one coefficient stand
+                    together, which nothing in a file tells
     undo_dataparser dataparser_transforms.json of nerfstudio: back to the axes and size of the photographs
 
     Raises BitstreamError if the file is damaged, SceneError if it cannot be read or holds no Gaussians, UserInputError.
@@ -49,7 +52,7 @@ def read(
     where = Path(path)
     if where.is_dir():
         where = where / (INDEX if (where / INDEX).exists() else META)
-    source = _checked(Source.open(where, spz_frame=spz_frame, level=level))
+    source = _checked(Source.open(where, spz_frame=spz_frame, level=level, sh_layout=sh_layout))
     scene = _decoded(source, format, limits, frame, strict)
     if undo_dataparser is None:
         return scene
@@ -136,6 +139,8 @@ def _unpack(bundle: bytes, meta: Path) -> None:
 def _checked(source: Source) -> Source:
     if source.spz_frame != "raw":
         axes_of(source.spz_frame)
+    if source.sh_layout not in ("planar", "interleaved"):
+        raise UserInputError(f"sh_layout is '{source.sh_layout}'; it may be planar, interleaved")
     return source
 
 

@@ -5,6 +5,7 @@ Source: the real SH basis and signs of 3D Gaussian Splatting (arXiv 2308.04079).
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -111,6 +112,17 @@ def transformed(
         quats=_product(_quat_of(rotation), scene.quats.astype(np.float64)).astype(np.float32),
         sh_rest=rest,
     )
+
+
+def placed(scene: GaussianScene, place: Matrix) -> GaussianScene:
+    """Map every point by a matrix [4,4]. Raises UserInputError if that mirrors or shears, as `transformed` does."""
+    if np.array_equal(place, np.eye(4)):
+        return scene
+    volume = np.linalg.det(place[:3, :3])
+    if volume < 0:
+        raise UserInputError("its scale is negative: it mirrors them")
+    scale = math.pow(volume, 1 / 3) or 1.0
+    return transformed(scene, place[:3, :3] / scale, scale, place[:3, 3])
 
 
 def band_rotation(rotation: Matrix, degree: int) -> Matrix:

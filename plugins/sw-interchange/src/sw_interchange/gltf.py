@@ -6,9 +6,7 @@ Source: the text of the extension in KhronosGroup/glTF.
 from __future__ import annotations
 
 import json
-import math
 import struct
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,10 +14,11 @@ import numpy.typing as npt
 
 from splatwizard_core.api import BitstreamError, UserInputError
 from sw_interchange.bands import COEFFICIENTS, Array
-from sw_interchange.frames import transformed
-from sw_interchange.gltf_writer import EXTENSION
-from sw_interchange.scene import FLAT, LARGEST_LOGIT, GaussianScene, Limits, ReadReport, decoded_bytes
+from sw_interchange.frames import placed
+from sw_interchange.gltf_writer import EXTENSION, SPZ
+from sw_interchange.scene import FLAT, LARGEST_LOGIT, GaussianScene, Limits, ReadReport, decoded_bytes, joined
 from sw_interchange.source import Source, json_reason
+from sw_interchange.spz import read_spz
 
 MAX_JSON = 1 << 24
 MAX_NODES = 1 << 16
@@ -76,6 +75,23 @@ class _Document:
             raise self.error(f"'{key}' is {found!r:.20}, which is no size")
         return found
 
+    def view(self, index: Any) -> dict[str, Any]:
+        """A part of the second chunk."""
+        view = self.item("bufferViews", index)
+        buffer = self.item("buffers", view.get("buffer"))
+        if view["buffer"] != 0 or "uri" in buffer:
+            raise self.error("its numbers lie in another file, which is not opened")
+        return view
+
+    def bytes_of(self, index: Any) -> memoryview:
+        """All bytes of a view."""
+        view = self.view(index)
+        start, length = self.whole(view, "byteOffset", 0), self.whole(view, "byteLength")
+        self.read += length
+        if start + length > len(self.blob) or self.read > MOST_READ * len(self.blob):
+            raise self.error("a view reaches beyond its buffer, or is read too often")
+        return self.blob[start : start + length]
+
     def column(self, index: Any) -> Array:
         """[N,width] float32 of an accessor; normalised integers become what they stand for."""
         accessor = self.item("accessors", index)
@@ -85,10 +101,7 @@ class _Document:
         )
         if component is None or width is None or "sparse" in accessor:
             raise self.error(f"accessor {index} has a type, or a sparse form, that splats do not have")
-        view = self.item("bufferViews", accessor.get("bufferView"))
-        buffer = self.item("buffers", view.get("buffer"))
-        if view["buffer"] != 0 or "uri" in buffer:
-            raise self.error("its numbers lie in another file, which is not opened")
+        view = self.view(accessor.get("bufferView"))
         row = np.dtype((component, (width,)))
         count, stride = self.whole(accessor, "count"), self.whole(view, "byteStride", 0) or row.itemsize
         self.rows += count
@@ -120,11 +133,7 @@ def read_gltf(source: Source, limits: Limits, report: ReadReport) -> GaussianSce
     parts = [_primitive(document, each, place, report) for each, place in _placed(document)]
     if not parts:
         raise document.error(f"there are no splats in it: nothing uses {EXTENSION}")
-    k = COEFFICIENTS[max(each.sh_degree for each in parts)]
-    rest = [np.pad(each.sh_rest, ((0, 0), (0, k - each.sh_rest.shape[1]), (0, 0))) for each in parts]
-    names = ("means", "log_scales", "quats", "opacity_logits", "sh_dc")
-    joined = {name: np.concatenate([getattr(each, name) for each in parts]) for name in names}
-    return replace(parts[0], **joined, sh_rest=np.concatenate(rest))
+    return joined(parts)
 
 
 def _placed(document: _Document) -> list[tuple[dict[str, Any], Matrix]]:
@@ -192,6 +201,8 @@ def _primitive(document: _Document, primitive: dict[str, Any], place: Matrix, re
     extension = primitive["extensions"][EXTENSION]
     if isinstance(extension, dict) and extension.get("colorSpace") == "lin_rec709_display":
         report.warnings.append("its colours are linear, and are taken as they are: they will look too dark")
+    if isinstance(extension, dict) and isinstance(packed := extension.get("extensions"), dict) and packed:
+        return _moved(document, _unpacked(document, packed, report), place)
     attributes = primitive.get("attributes")
     if not isinstance(attributes, dict):
         raise document.error("a primitive without attributes")
@@ -224,15 +235,23 @@ def _primitive(document: _Document, primitive: dict[str, Any], place: Matrix, re
     return _moved(document, scene, place)
 
 
+def _unpacked(document: _Document, packed: dict[str, Any], report: ReadReport) -> GaussianScene:
+    """The splats of a primitive that are compressed in a way of an extension of the extension."""
+    found = packed.get(SPZ)
+    if not isinstance(found, dict):
+        names = ", ".join(f"{name:.60}" for name in sorted(packed)[:3])
+        raise document.error(f"its splats are compressed by {names}, which is not read; {SPZ} is")
+    source = Source(document.bytes_of(found.get("bufferView")), f"{document.name}/spz")
+    scene = read_spz(source, document.limits, report)
+    document.rows += scene.num_gaussians
+    document.limits.check(document.rows, decoded_bytes(document.rows, 15), document.size, document.name)
+    report.version = "2.0"
+    return scene.in_frame("LUF")
+
+
 def _moved(document: _Document, scene: GaussianScene, place: Matrix) -> GaussianScene:
-    if np.array_equal(place, np.eye(4)):
-        return scene
-    volume = np.linalg.det(place[:3, :3])
-    if volume < 0:
-        raise document.error("a node mirrors its splats, which is not read: its scale is negative")
-    scale = math.pow(volume, 1 / 3) or 1.0
     try:
         with np.errstate(all="ignore"):
-            return transformed(scene, place[:3, :3] / scale, scale, place[:3, 3])
+            return placed(scene, place)
     except UserInputError as error:
         raise document.error(f"a node moves its splats in a way that is not read: {error}") from error

@@ -1,6 +1,6 @@
-"""Writing binary glTF with KHR_gaussian_splatting (release candidate of 2026), float32 throughout.
+"""Writing binary glTF with KHR_gaussian_splatting (ratified in June 2026), float32 throughout.
 
-Source: the text of the extension in KhronosGroup/glTF.
+Source: the text of the extension in KhronosGroup/glTF, and of the proposal KHR_gaussian_splatting_compression_spz_2.
 """
 
 from __future__ import annotations
@@ -14,9 +14,13 @@ import numpy as np
 from splatwizard_core.api import SH_C0, UserInputError
 from sw_interchange.bands import Array
 from sw_interchange.options import Options
-from sw_interchange.scene import GaussianScene, WriteReport, linear_scales, sigmoid
+from sw_interchange.scene import GaussianScene, Limits, ReadReport, WriteReport, linear_scales, sigmoid
+from sw_interchange.source import Source
+from sw_interchange.spz import SpzOptions, read_spz, write_spz
 
 EXTENSION = "KHR_gaussian_splatting"
+SPZ = "KHR_gaussian_splatting_compression_spz_2"
+"""A proposal of 2025, read by Cesium and Babylon.js: all values of a primitive are one .spz of version 2."""
 FLOAT, UBYTE = 5126, 5121
 MAX_FILE = (1 << 32) - 1
 
@@ -25,14 +29,18 @@ class GltfOptions(Options):
     """Options of `.glb`.
 
     color_0     with colours for viewers that know no splats and draw points
+    compression "spz_2": as .spz of version 2, an experiment, since the extension for it is a proposal
     """
 
     color_0: bool = True
-    choices = {"color_0": (True, False)}
+    compression: str | None = None
+    choices = {"color_0": (True, False), "compression": (None, "spz_2")}
 
 
 def write_gltf(scene: GaussianScene, options: GltfOptions, report: WriteReport) -> list[bytes]:
     """Encode a scene in LUF as .glb. Raises UserInputError for one of 4 GiB and more."""
+    if options.compression is not None:
+        return _with_spz(scene, report)
     columns = _columns(scene, linear_scales(scene.log_scales, report), color_0=options.color_0)
     accessors, views, attributes, blob = [], [], {}, []
     at = 0
@@ -52,15 +60,38 @@ def write_gltf(scene: GaussianScene, options: GltfOptions, report: WriteReport) 
         views.append({"buffer": 0, "byteOffset": at, "byteLength": len(raw)})
         at += len(raw)  # all rows are multiples of four bytes
         blob.append(raw)
-    text = json.dumps(_document(accessors, views, attributes, at), separators=(",", ":")).encode()
+    return _file(_document(accessors, views, attributes, at), blob)
+
+
+def _file(document: dict[str, Any], blob: list[bytes]) -> list[bytes]:
+    at = sum(map(len, blob))
+    text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     size = 12 + 8 + len(text) + 8 + at
     if size > MAX_FILE:
-        raise UserInputError(
-            f"{scene.num_gaussians:,} Gaussians make a .glb of {size:,} bytes: it holds less than 4 GiB"
-        )
+        raise UserInputError(f"these Gaussians make a .glb of {size:,} bytes: it holds less than 4 GiB")
     head = struct.pack("<4sII", b"glTF", 2, size) + struct.pack("<I4s", len(text), b"JSON") + text
     return [head + struct.pack("<I4s", at, b"BIN\0"), *blob]
+
+
+def _with_spz(scene: GaussianScene, report: WriteReport) -> list[bytes]:
+    """A file whose accessors tell types and numbers, and whose values are one .spz."""
+    options = SpzOptions(version=2)
+    packed = b"".join(write_spz(scene.in_frame("RDF"), options, report))
+    places = ReadReport("spz")
+    kept = read_spz(Source(packed, "spz"), Limits(), places).in_frame("LUF").means  # bounds are of what is decoded
+    accessors: list[dict[str, Any]] = []
+    attributes: dict[str, int] = {}
+    for name, values in _columns(scene.select(slice(0, 1)), np.zeros((1, 3), np.float32), color_0=False).items():
+        attributes[name] = len(accessors)
+        kind = "SCALAR" if values.ndim == 1 else f"VEC{values.shape[1]}"
+        accessors.append({"componentType": FLOAT, "count": scene.num_gaussians, "type": kind})
+    accessors[attributes["POSITION"]] |= {"min": kept.min(0).tolist(), "max": kept.max(0).tolist()}
+    padded = packed + bytes(-len(packed) % 4)
+    document = _document(accessors, [{"buffer": 0, "byteLength": len(packed)}], attributes, len(padded))
+    document["meshes"][0]["primitives"][0]["extensions"][EXTENSION]["extensions"] = {SPZ: {"bufferView": 0}}
+    document["extensionsUsed"] = document["extensionsRequired"] = [EXTENSION, SPZ]
+    return _file(document, [padded])
 
 
 def _columns(scene: GaussianScene, scales: Array, *, color_0: bool) -> dict[str, Any]:

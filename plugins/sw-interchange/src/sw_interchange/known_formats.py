@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from sw_gaussians.ply_tables import BOM
+
 from splatwizard_core.api import BitstreamError, UserInputError
 from sw_interchange.source import Source
 from sw_interchange.spz_packing import inflate
@@ -57,6 +59,7 @@ class Format:
 
 _FORMATS = (
     Format("ply", ".ply", "3DGS .ply in all its dialects, float32", 4, reader="ply:read_ply", writer="ply:write_ply"),
+    Format("zipped-ply", ".zip", "a .ply in a ZIP archive, as Luma gives it", 4, reader="ply:read_zipped_ply"),
     Format("splat", ".splat", "32 bytes per Gaussian, no SH", 0, reader="splat:read_splat", writer="splat:write_splat",
            options="splat:SplatOptions"),
     Format("spz", ".spz", "quantised and compressed, SH included (Niantic)", 4, reader="spz:read_spz",
@@ -74,6 +77,12 @@ _FORMATS = (
     Format("ksplat", ".ksplat", "buckets of quantised Gaussians (mkkellogg)", 2, reader="ksplat:read_ksplat"),
     Format("gltf", ".glb", "binary glTF with KHR_gaussian_splatting, float32", 3, frame="LUF",
            reader="gltf:read_gltf", writer="gltf_writer:write_gltf", options="gltf_writer:GltfOptions"),
+    Format("usda", ".usda", "OpenUSD as text: a prim ParticleField3DGaussianSplat", 4, frame="RUB",
+           reader="usd:read_usd", writer="usd_writer:write_usda", options="usd_writer:UsdOptions"),
+    Format("usdc", ".usdc", "OpenUSD as crate, float32", 4, frame="RUB", reader="usd:read_usd",
+           writer="usd_writer:write_usdc", options="usd_writer:UsdOptions"),
+    Format("usdz", ".usdz", "OpenUSD as archive of a crate", 4, frame="RUB", reader="usd:read_usd",
+           writer="usd_writer:write_usdz", options="usd_writer:UsdOptions"),
     Format("checkpoint", ".pt", "PyTorch checkpoints of gsplat, nerfstudio and 3DGS", 4,
            reader="checkpoint:read_checkpoint"),
 )  # fmt: skip
@@ -106,7 +115,7 @@ def detect(source: Source) -> Format:
     head, name = source.head(1 << 12), source.name.lower()
     if name.endswith(".splat") and not len(source.data) % 32 and not _is_something_else(source):
         return format_named("splat")
-    if head[:4] in (b"ply\n", b"ply\r"):
+    if head.removeprefix(BOM)[:4] in (b"ply\n", b"ply\r"):
         return format_named("compressed-ply" if b"packed_position" in head else "ply")
     if head[:4] == b"NGSP" or head[:2] == b"\x1f\x8b":
         return format_named("spz")
@@ -114,6 +123,8 @@ def detect(source: Source) -> Format:
         return format_named(_kind_of_archive(source))
     if head[:4] == b"glTF":
         return format_named("gltf")
+    if head[:7] == b"#usda 1" or head[:8] == b"PXR-USDC":
+        return format_named("usda" if head[:1] == b"#" else "usdc")
     if head[:4] == b"RAD0":
         return format_named("rad")
     if name.endswith(".lcc"):
@@ -125,8 +136,6 @@ def detect(source: Source) -> Format:
     for suffix, found in ((".splat", "splat"), (".ksplat", "ksplat")):
         if name.endswith(suffix):
             return format_named(found)
-    if head[:7] == b"#usda 1" or head[:8] == b"PXR-USDC":
-        raise BitstreamError(f"{source.name}: USD is not read: export the scene as .ply where it was made")
     raise BitstreamError(f"{source.name}: neither its first bytes nor its suffix is that of a format with Gaussians")
 
 
@@ -148,12 +157,14 @@ def _is_something_else(source: Source) -> bool:
 
 
 def _kind_of_archive(source: Source) -> str:
-    """SOG bundle or torch checkpoint: both are ZIP archives."""
-    from sw_interchange.archive import entries_of
+    """SOG bundle, torch checkpoint, usdz or a .ply: all are ZIP archives."""
+    from sw_interchange.archive import entries_of, is_one_ply
 
     names = [entry.filename for entry in entries_of(source)]
     if any(name.endswith("/data.pkl") for name in names):
         return "checkpoint"
     if any(name.lower().endswith((".usd", ".usda", ".usdc")) for name in names):
-        raise BitstreamError(f"{source.name}: USD is not read: export the scene as .ply where it was made")
+        return "usdz"
+    if is_one_ply(names):
+        return "zipped-ply"
     return "sog"

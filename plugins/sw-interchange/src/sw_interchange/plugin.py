@@ -19,10 +19,18 @@ def register_exporters(registry: Registry) -> None:
                  summary="the same as images beside their meta.json")  # fmt: skip
     registry.add("gltf", "sw_interchange.registered:export_gltf", suffix=".glb",
                  summary="binary glTF with KHR_gaussian_splatting, float32")  # fmt: skip
+    registry.add("usda", "sw_interchange.registered:export_usda", suffix=".usda",
+                 summary="OpenUSD as text, up to 200,000 Gaussians")  # fmt: skip
+    registry.add("usdc", "sw_interchange.registered:export_usdc", suffix=".usdc",
+                 summary="OpenUSD as crate, through usd-core")  # fmt: skip
+    registry.add("usdz", "sw_interchange.registered:export_usdz", suffix=".usdz",
+                 summary="OpenUSD as archive of a crate, through usd-core")  # fmt: skip
 
 
 @hookimpl
 def register_importers(registry: Registry) -> None:
+    registry.add("zipped-ply", "sw_interchange.registered:import_zipped_ply", suffix=".zip",
+                 summary="a .ply in a ZIP archive, as Luma gives it")  # fmt: skip
     registry.add("splat", "sw_interchange.registered:import_splat", suffix=".splat",
                  summary=".splat: 32 bytes per Gaussian, no SH")  # fmt: skip
     registry.add("spz", "sw_interchange.registered:import_spz", suffix=".spz",
@@ -43,6 +51,9 @@ def register_importers(registry: Registry) -> None:
                  summary=".ksplat of GaussianSplats3D, levels 0 to 2")  # fmt: skip
     registry.add("gltf", "sw_interchange.registered:import_gltf", suffix=".glb",
                  summary="binary glTF with KHR_gaussian_splatting")  # fmt: skip
+    for suffix in ("usda", "usdc", "usdz", "usd"):
+        registry.add(suffix, "sw_interchange.registered:import_usd", suffix=f".{suffix}",
+                     summary="splats of OpenUSD, through usd-core")  # fmt: skip
     for suffix in ("pt", "ckpt", "pth"):
         registry.add(f"checkpoint-{suffix}", "sw_interchange.registered:import_checkpoint", suffix=f".{suffix}",
                      summary="checkpoints of gsplat (.pt), nerfstudio (.ckpt) and 3DGS (.pth)")  # fmt: skip

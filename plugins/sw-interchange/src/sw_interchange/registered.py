@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 Path = str | os.PathLike[str]
 
 
-def _importer(name: str) -> Callable[[Path], GaussianModel]:
+def _importer(name: str | None) -> Callable[[Path], GaussianModel]:
     def load(path: Path) -> GaussianModel:
         scene = read(path, format=name)
         if scene.sh_degree > 3:
@@ -73,6 +73,7 @@ def notices(report: ReadReport) -> list[str]:
     return found
 
 
+import_zipped_ply = _importer("zipped-ply")
 import_splat, export_splat = _importer("splat"), _exporter("splat")
 import_spz, export_spz, export_spz4 = _importer("spz"), _exporter("spz"), _exporter("spz", version=4)
 import_sog, export_sog = _importer("sog"), _exporter("sog")
@@ -83,4 +84,6 @@ import_lcc = _importer("lcc")
 import_rad = _importer("rad")
 import_ksplat = _importer("ksplat")
 import_gltf, export_gltf = _importer("gltf"), _exporter("gltf")
+import_usd = _importer(None)
+export_usda, export_usdc, export_usdz = _exporter("usda"), _exporter("usdc"), _exporter("usdz")
 import_checkpoint = _importer("checkpoint")

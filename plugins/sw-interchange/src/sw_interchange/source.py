@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from sw_gaussians.memory_map import memory_map
 
@@ -16,7 +17,7 @@ class Source:
     data    all of them; of a file a view of the pages that the system holds
     path    where they lie, if they lie anywhere: files beside it may belong to it
     name    for messages
-    spz_frame, level    options of the reader: see `files.read`
+    spz_frame, level, sh_layout     options of the reader: see `files.read`
     """
 
     data: bytes | memoryview
@@ -24,12 +25,13 @@ class Source:
     path: Path | None = None
     spz_frame: str = "RUB"
     level: int = 0
+    sh_layout: str = "planar"
 
     @classmethod
-    def open(cls, path: str | os.PathLike[str], *, spz_frame: str = "RUB", level: int = 0) -> Source:
+    def open(cls, path: str | os.PathLike[str], **options: Any) -> Source:
         """Map a file. Raises SceneError if it cannot be read."""
         where = Path(path)
-        return cls(memory_map(where), where.name, where, spz_frame, level)
+        return cls(memory_map(where), where.name, where, **options)
 
     def head(self, count: int) -> bytes:
         """The first bytes, at most `count`."""

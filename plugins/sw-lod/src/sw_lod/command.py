@@ -49,14 +49,19 @@ def lod(file: Path, out: str, levels: int | None, chunk: int | None, device: str
     record = write_lod(file, out, levels=levels, chunk=chunk, device=device or "auto", say=say)
     if "packets" in record:
         ends = record["packets"]
-        told = f"{record['out']}: {ends[-1]:,} bytes in {len(ends)} packets, the whole scene coarsely in {ends[0]:,}"
+        packets = _several(len(ends), "packet")
+        told = f"{record['out']}: {ends[-1]:,} bytes in {packets}, the whole scene coarsely in {ends[0]:,}"
         print_facts(record, as_json, told)
         return
     counts = ", ".join(f"{count:,}" for count in record["counts"])
     told = (
-        f"{record['out']}: {len(record['counts'])} levels ({counts} Gaussians) in {record['leaves']} pieces, "
-        f"{record['units']} units of {record['bytes']:,} bytes"
+        f"{record['out']}: {_several(len(record['counts']), 'level')} ({counts} Gaussians) in "
+        f"{_several(record['leaves'], 'piece')}, {_several(record['units'], 'unit')} of {record['bytes']:,} bytes"
     )
     for line in record["warnings"]:
         say(line)
     print_facts(record, as_json, told)
+
+
+def _several(count: int, noun: str) -> str:
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -75,8 +76,14 @@ def write_lod(
         scenes.append(from_gaussians(model))
         say(f"level {level}: {count:,} Gaussians")
     merged = time.perf_counter()
+    is_new = not target.parent.exists()
     target.parent.mkdir(parents=True, exist_ok=True)
-    facts = write_streamed(scenes, target, chunk=chunk or CHUNK, say=say)
+    try:
+        facts = write_streamed(scenes, target, chunk=chunk or CHUNK, say=say)
+    except BaseException:  # an interrupt too: half of a scene is no use to anybody
+        if is_new:
+            shutil.rmtree(target.parent, ignore_errors=True)
+        raise
     ended = time.perf_counter()
     seconds = {"merge": round(merged - started, 3), "write": round(ended - merged, 3)}
     return {"source": {"file": name, "gaussians": scenes[0].num_gaussians}, "out": str(target), **facts,

@@ -42,6 +42,7 @@ def info(path: str, as_json: bool, chosen: Choices) -> None:
     where = existing(path) if Path(path).exists() else Path(path)
     if (where / "scene.swz").is_file() and (where / "config.toml").is_file():
         where = where / "scene.swz"
+    where = where / "lod-meta.json" if (where / "lod-meta.json").is_file() else where
     show: Callable[[dict[str, Any]], None] = _print_plain
     if where.suffix == ".swz" or (where.is_file() and _head(where, 4) == b"SPWZ"):
         kind, facts, show = "file", _file_facts(where), _print_file

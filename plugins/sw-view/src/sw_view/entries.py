@@ -23,11 +23,10 @@ from splatwizard_core.tooling import Choices, NegotiatedRasterizer, bytes_with_n
 from sw_view.coded_file import with_anchors
 from sw_view.drawing import Drawing
 from sw_view.packing import Packed, solid_means
-from sw_view.page_file import MADE_UP, About
+from sw_view.page_file import LIVE, MADE_UP, About
 from sw_view.shown_cameras import Surroundings, made_up_surroundings, surroundings_about, surroundings_of
 
 ENCODED, CONFIG = "scene.swz", "config.toml"
-LIVE = "The method's Gaussians depend on the camera: they are computed anew wherever it comes to rest."
 MOST = 200
 """Runs of one folder that are offered."""
 

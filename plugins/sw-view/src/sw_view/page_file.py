@@ -12,7 +12,7 @@ import html
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 from sw_gaussians.render_options import antialias_of, eps2d_of
 
-from splatwizard_core.api import Camera, SplatModel, replacing
-from sw_view.coded_file import with_file
+from splatwizard_core.api import Camera, GaussianModel, SplatModel, replacing
+from sw_view.coded_file import with_anchors, with_file
 from sw_view.packing import Packed, pack
 from sw_view.shown_cameras import NamedCamera, Surroundings, surroundings_about
 
@@ -32,6 +32,7 @@ POLICY = (
 )
 """Policy of the page (CSP): nothing but its own script, style, workers, and an empty icon. It asks no network."""
 MADE_UP = "Nothing was known of the scene's cameras: these were made up around the Gaussians, with -y as up."
+LIVE = "The method's Gaussians depend on the camera: they are computed anew wherever it comes to rest."
 FILE_NAME = "scene.html"
 """Of a run directory; report.html has a link to it."""
 
@@ -100,9 +101,14 @@ def _packed(model: SplatModel | Packed) -> Packed:
 
 
 def export_page(model: SplatModel, path: str | os.PathLike[str]) -> None:
-    """Write the page of a model of which nothing else is known (`sw export`): cameras are made up around it."""
+    """Write the page of a model of which nothing but its file is known (`sw export`): cameras are made up around it."""
     about = About(Path(path).stem, eps2d=eps2d_of(model), antialias=antialias_of(model), note=MADE_UP)
-    write_page(model, path, about, None)
+    if isinstance(model, GaussianModel):
+        write_page(model, path, about, None)
+        return
+    around = surroundings_about(getattr(model, model.ROWS[0]).detach().float().cpu().numpy()[:, :3])
+    anchors = with_anchors(model, Path(str(model.origin.get("file", ""))), [each.camera for each in around.cameras])
+    write_page(anchors or model, path, replace(about, note=f"{LIVE} {MADE_UP}"), around)
 
 
 def _page(packed: Packed, about: About, around: Surroundings) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -55,8 +55,6 @@ class GaussianModel(SplatModel):
     """Columns of `log_scales`; a subclass of flat Gaussians (surfels) has 2."""
     RAW: tuple[str, ...] = ("means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats")
     """The raw parameters of any GaussianModel, in the order of the constructor."""
-    origin: Mapping[str, Any] = {}
-    """Facts that an importer tells of its file; `raster` in them: options that it asks of a rasterizer."""
     ROWS: tuple[str, ...] = (*RAW, "grad_accum", "denom", "max_radii2d")
 
     means: nn.Parameter

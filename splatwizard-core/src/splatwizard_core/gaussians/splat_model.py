@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
@@ -29,6 +30,8 @@ class SplatModel(nn.Module):
     """Names of the parameters and buffers whose first dimension is the primitive; attributes of the model."""
     ROW_LABEL: ClassVar[str] = "gaussians"
     """The primitives' name in progress and messages, plural; a model of anchors says "anchors"."""
+    origin: Mapping[str, Any] = {}
+    """Facts that the reader of its file tells; `raster` in them: options that it asks of a rasterizer."""
 
     def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
         """The activated Gaussians that `camera` sees; differentiable with respect to the parameters.

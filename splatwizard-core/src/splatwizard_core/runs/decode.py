@@ -48,8 +48,8 @@ def open_model(
     model = decode_model(reader, plugins).to(device).eval().requires_grad_(False)
     if isinstance(model, GaussianModel):
         model = leave_out_senseless(model, reader.name, tell=tell)
-        model.origin = {**model.origin, "raster": reader.raster, "file": str(path)}
-        with_origin(model, as_origin(reader.world_origin) or NOWHERE)
+    with_origin(model, as_origin(reader.world_origin) or NOWHERE)
+    model.origin = {**model.origin, "raster": reader.raster, "file": str(path)}
     return model, reader
 
 
