@@ -86,6 +86,7 @@ class Phases(Params):
     soft: int = Field(13_000, ge=1, description="first step of soft rounding")
     sharpness: float = Field(8.0, gt=1, le=64, description="of soft rounding at its end; it begins at 1")
     hard: int = Field(15_501, ge=1, description="first step that rounds, with straight-through gradients")
+    subsets: int = Field(11_500, ge=1, description="with layers: step that forms the subsets of splats")
     prefixes: int = Field(12_001, ge=1, description="with layers: first step that may draw some packets alone")
     order: int = Field(16_000, ge=1, description="with layers: step that fixes the order of packets")
     freeze: int = Field(17_000, ge=1, description="step that fixes all integers; floats of the file learn on")
@@ -152,6 +153,7 @@ class LayersOfTheFile(Params):
         le=10_000,
         description="updates that fit size and opacity of subsets while others are missing, for each number of them",
     )
+    every: int = Field(2_000, ge=0, description="steps between such fits in training; 0: one at the end alone")
     views: int = Field(16, ge=1, description="training views by which the order of packets is chosen")
 
     @field_validator("shares")
