@@ -219,8 +219,7 @@ class WispModel(SplatModel):
         if swell is not None:
             known = known._replace(swell=swell)
         known = known.of(self.subsets)
-        values = as_known(drawn, forecast, known)
-        return self._inputs(self._shown(values, None, None)._replace(visible=known.there))
+        return self._inputs(self._shown(as_known(drawn, forecast, known), None, None)._replace(visible=known.there))
 
     def _shown(self, values: Tensor, bits: Tensor | None, places: Tensor | None) -> Shown:
         edges = self.log_edges(self.levels)
