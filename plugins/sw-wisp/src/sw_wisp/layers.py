@@ -57,11 +57,7 @@ class Layers:
 
 
 class Known(NamedTuple):
-    """Facts of each subset that packets tell.
-
-    there, missing, viewed  [J] whether its splats are there, refinements that are missing, whether latents are there
-    swell                   [J,2] what is added to size and opacity
-    """
+    """Facts of each subset that packets tell: whether it is there, refinements missing, latents, what swells it [J,2]."""
 
     there: Tensor
     missing: Tensor

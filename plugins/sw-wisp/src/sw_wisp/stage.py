@@ -332,7 +332,9 @@ class WispStage(Stage):
         model.layers = Layers.of_subsets(len(layers.shares), layers.planes)
         self.measure(model)
 
-    def fit_swell(self, model: WispModel, cameras: list[View], rasterizer: Rasterizer, scene: Scene, step: int) -> None:
+    def fit_swell(
+        self, model: WispModel, cameras: CameraIterator, rasterizer: Rasterizer, scene: Scene, step: int
+    ) -> None:
         """Find what size and opacity of subsets become while others are missing, as the splats stand."""
         draws, background = stream(model.split_seed, f"swell/{step}"), scene.background.to(model.device)
         with still(model):
@@ -439,7 +441,7 @@ class WispStage(Stage):
         if model.layers.order:
             background = scene.background.to(model.device)
             if self.config.layers.swell:
-                self.fit_swell(model, scene.train, self._rasterizer, scene, self.iterations)
+                self.fit_swell(model, CameraIterator(scene.train), self._rasterizer, scene, self.iterations)
             with still(model):
                 psnr = psnr_of_prefixes(model, scene.train, self._rasterizer, background)
             model.layers = replace(model.layers, psnr=psnr)
