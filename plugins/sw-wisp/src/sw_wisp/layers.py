@@ -57,7 +57,7 @@ class Layers:
 
 
 class Known(NamedTuple):
-    """Facts of each subset that packets tell: whether it is there, refinements missing, latents, what swells it [J,2]."""
+    """Facts of each subset [J] that packets tell: it is there, missing refinements, latents; what swells it [J,2]."""
 
     there: Tensor
     missing: Tensor
