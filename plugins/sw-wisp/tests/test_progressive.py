@@ -16,9 +16,11 @@ from splatwizard_core.tooling import Prefix
 from splatwizard_core.training.pipeline import TrainingStopped
 from sw_wisp.layers import Known, Layers, admissible, as_known, greedy_order, split
 from sw_wisp.method import Wisp
+from sw_wisp.model import WispModel
 from sw_wisp.packets import Packet, check_order
 from sw_wisp.prefixes import fitted_swell, packet_bits, squared_error
 from sw_wisp.rate import Forecast
+from sw_wisp.rounding import HARD
 
 PROGRESSIVE = {**SHORT, "layers.progressive": True, "layers.views": 2, "layers.swell": 6, "context.fit": 60}
 
@@ -84,6 +86,28 @@ def test_what_is_drawn_of_a_prefix_is_what_decoders_draw(plain, plugins, toy, ra
         assert torch.allclose(*images, atol=2e-3), cut
 
 
+def test_a_step_that_draws_packets_draws_what_decoders_do(plain):
+    model = copy.deepcopy(plain[1]).train()
+    model.phase, order = HARD, model.layers.order
+    for packets in (1, len(order) - 1):
+        model.packets = packets
+        with torch.no_grad():
+            shown, decoded = model.shown(model.draws()), model.prefix_of(order[:packets], *model.predicted())
+        assert torch.allclose(shown.opacities, decoded.opacities)
+        assert torch.allclose(shown.covariances, decoded.cov3d)
+        assert torch.equal(shown.visible, decoded.visible)
+    assert any(any(row) for row in model.layers.swell)
+
+
+def test_subsets_that_are_formed_early_stay_while_splats_go(plugins):
+    early = {**PROGRESSIVE, "phases.subsets": 4_001, "phases.prefixes": 4_001}
+    found = short_training.firings(configured(plugins, **early).stages()[0])
+    assert found["form subsets"] == [20]
+    assert found["draw some packets alone"][0] == found["swell subsets"][0] == 20
+    assert max(found["remove by rate and distortion"]) > 20
+    assert "subsets" in WispModel.ROWS
+
+
 def test_what_swells_prefixes_lowers_their_loss(plain, toy, rasterizer):
     model = copy.deepcopy(plain[1]).eval()
     draws = torch.Generator().manual_seed(0)
@@ -108,7 +132,7 @@ def test_a_resumed_training_has_the_same_layers(train, plain, tmp_path):
 
 def test_flat_trainings_have_no_layers(plugins):
     names = short_training.firings(configured(plugins).stages()[0])
-    assert not {"draw some packets alone", "order packets"} & set(names)
+    assert not {"form subsets", "swell subsets", "draw some packets alone", "order packets"} & set(names)
     found = short_training.firings(configured(plugins, **PROGRESSIVE).stages()[0])
     assert found["draw some packets alone"][0] == 60
     assert found["order packets"] == [80]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, PositiveFloat
 from sw_gaussians.named_blocks import Choosing, OwnCodec
 
 from splatwizard_core.api import Params
@@ -86,6 +86,7 @@ class Phases(Params):
     soft: int = Field(13_000, ge=1, description="first step of soft rounding")
     sharpness: float = Field(8.0, gt=1, le=64, description="of soft rounding at its end; it begins at 1")
     hard: int = Field(15_501, ge=1, description="first step that rounds, with straight-through gradients")
+    subsets: int = Field(11_500, ge=1, description="with layers: step that forms the subsets of splats")
     prefixes: int = Field(12_001, ge=1, description="with layers: first step that may draw some packets alone")
     order: int = Field(16_000, ge=1, description="with layers: step that fixes the order of packets")
     freeze: int = Field(17_000, ge=1, description="step that fixes all integers; floats of the file learn on")
@@ -137,29 +138,17 @@ class LayersOfTheFile(Params):
     """Layers: the file comes in packets, and each prefix of them is a scene."""
 
     progressive: bool = Field(False, description="write splats in subsets, and their numbers coarse before fine")
-    shares: list[float] = Field(
-        [0.12, 0.18, 0.28, 0.42],
-        min_length=1,
-        max_length=16,
-        description="of the bits of first packets, for each subset; at most 16",
+    shares: list[PositiveFloat] = Field(
+        [0.12, 0.18, 0.28, 0.42], min_length=1, max_length=16, description="of the bits of first packets, by subset"
     )
     planes: int = Field(1, ge=0, le=2, description="refinements of shape, size and colour, each by a factor 3")
     train: float = Field(0.5, ge=0, le=1, description="share of steps that draw some packets alone")
     weight: float = Field(0.5, gt=0, le=1, description="of the loss of such a step")
     swell: int = Field(
-        60,
-        ge=0,
-        le=10_000,
-        description="updates that fit size and opacity of subsets while others are missing, for each number of them",
+        60, ge=0, le=10_000, description="updates that fit size and opacity of subsets for each number of missing ones"
     )
+    every: int = Field(2_000, ge=0, description="steps between such fits in training; 0: one at the end alone")
     views: int = Field(16, ge=1, description="training views by which the order of packets is chosen")
-
-    @field_validator("shares")
-    @classmethod
-    def _positive(cls, shares: list[float]) -> list[float]:
-        if min(shares) <= 0:
-            raise ValueError("shares above 0")
-        return shares
 
 
 class Codec(OwnCodec):

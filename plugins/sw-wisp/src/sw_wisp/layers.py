@@ -48,21 +48,21 @@ class Layers:
         """Number of subsets."""
         return max((subset for subset, _ in self.order), default=0) + 1
 
-    def swell_with(self, there: int, device: torch.device) -> Tensor | None:
-        """Return the additions [J,2] to size and opacity of each subset while so many are there; None: nothing."""
-        if not 0 < there <= len(self.swell):
-            return None
+    def swell_with(self, there: int, device: torch.device) -> Tensor:
+        """Return what is added [J,2] to size and opacity of each subset while so many are there."""
         found = torch.zeros(self.subsets, 2, device=device)
-        found[:there] = torch.tensor(self.swell[there - 1], device=device).view(there, 2) / SWELL_UNIT
+        if 0 < there <= len(self.swell):
+            found[:there] = torch.tensor(self.swell[there - 1], device=device).view(there, 2) / SWELL_UNIT
         return found
 
 
 class Known(NamedTuple):
-    """Facts of each subset [J] that packets tell: whether its splats are there, missing refinements, latents."""
+    """Facts of each subset [J] that packets tell: it is there, missing refinements, latents; what swells it [J,2]."""
 
     there: Tensor
     missing: Tensor
     viewed: Tensor
+    swell: Tensor
 
     @classmethod
     def after(cls, packets: Sequence[tuple[int, str]], layers: Layers, device: torch.device) -> Known:
@@ -73,11 +73,12 @@ class Known(NamedTuple):
             there[subset] |= kind == "base"
             viewed[subset] |= kind == "view"
             missing[subset] -= kind == "fine"
-        return cls(*(torch.tensor(each, device=device) for each in (there, missing, viewed)))
+        facts = (torch.tensor(each, device=device) for each in (there, missing, viewed))
+        return cls(*facts, layers.swell_with(sum(there), device))
 
     def of(self, subsets: Tensor) -> Known:
         """Return the same for splats of these subsets [N]."""
-        return Known(self.there[subsets], self.missing[subsets], self.viewed[subsets])
+        return Known(*(each[subsets] for each in self))
 
 
 def as_known(values: Tensor, forecast: Forecast, known: Known) -> Tensor:
@@ -89,7 +90,7 @@ def as_known(values: Tensor, forecast: Forecast, known: Known) -> Tensor:
     width[:, REFINED] = 3.0 ** known.missing[:, None]
     offsets = ((values - forecast.mean) / forecast.steps).detach()
     coarse = torch.where(width > 1, (torch.round(offsets / width) * width - offsets) * forecast.steps.detach(), 0.0)
-    values = values + coarse
+    values = swelled(values + coarse, known.swell)
     latents = torch.where(known.viewed[:, None], values[:, LATENTS.columns], forecast.mean[:, LATENTS.columns])
     return torch.cat([values[:, : LATENTS.columns.start], latents], dim=1)
 

@@ -18,7 +18,7 @@ from sw_wisp.fast import replay
 from sw_wisp.fast.kernels import fit_kernels
 from sw_wisp.fast.splats import drawable as fast_drawable
 from sw_wisp.file import Scene
-from sw_wisp.layers import Known, Layers, as_known, swelled
+from sw_wisp.layers import Known, Layers, as_known
 from sw_wisp.numbers import GROUPS, NUMBERS, SIZE
 from sw_wisp.octree import Cells, position_bits
 from sw_wisp.plain import bounds_in, plain_gaussians
@@ -216,13 +216,10 @@ class WispModel(SplatModel):
         swell       [J,2] what is added to size and opacity of each subset; None: what the layers say
         """
         known = Known.after(packets, self.layers, self.device)
-        if swell is None:
-            swell = self.layers.swell_with(int(known.there.sum()), self.device)
-        known = known.of(self.subsets)
-        values = as_known(drawn, forecast, known)
         if swell is not None:
-            values = swelled(values, swell[self.subsets])
-        return self._inputs(self._shown(values, None, None)._replace(visible=known.there))
+            known = known._replace(swell=swell)
+        known = known.of(self.subsets)
+        return self._inputs(self._shown(as_known(drawn, forecast, known), None, None)._replace(visible=known.there))
 
     def _shown(self, values: Tensor, bits: Tensor | None, places: Tensor | None) -> Shown:
         edges = self.log_edges(self.levels)

@@ -37,7 +37,8 @@ def packet_bits(values: Tensor, forecast: Forecast, places: Tensor, planes: int)
     values      [N,22] as rounded
     places      [N] bits of their places
     """
-    known = Known(*(places.new_full((len(places),), x, dtype=torch.int64) for x in (1, planes)), places >= 0)
+    facts = (places.new_full((len(places),), x, dtype=torch.int64) for x in (1, planes))
+    known = Known(*facts, places >= 0, values.new_zeros(len(values), 2))
     widths = values.new_ones(NUMBERS)
     widths[REFINED] = 3.0**planes
     scale = forecast.scale - (widths > 1) * (planes * THIRD_OF_SCALE / UNIT)
@@ -77,21 +78,22 @@ def squared_error(
     return total
 
 
+@torch.enable_grad()
 def fitted_swell(
     model: WispModel, views: Sequence[View], rasterizer: Rasterizer, background: Tensor, updates: int,
     draws: torch.Generator,
 ) -> tuple[tuple[int, ...], ...]:  # fmt: skip
     """Return for 1, 2, ... subsets, while others are missing, what is added to size and opacity of each, in 1/32.
 
-    Few splats then cover what those that are missing leave open. Found by so many updates for each number of subsets,
-    all else fixed, in turn over the prefixes that have so many.
+    Few splats then cover what those that are missing leave open. Found from what the model has by so many updates for
+    each number of subsets, all else fixed, in turn over the prefixes that have so many.
     """
     with torch.no_grad():
         forecast, drawn = model.predicted()
     order, options, found = model.layers.order, RasterOptions(background=background), []
     for there in range(1, model.layers.subsets):
         ends = [n for n in range(1, len(order)) if sum(kind == "base" for _, kind in order[:n]) == there]
-        swell = torch.zeros(model.layers.subsets, 2, device=model.device, requires_grad=True)
+        swell = model.layers.swell_with(there, model.device).requires_grad_()
         optimizer = torch.optim.Adam([swell], lr=SWELL_LR)
         for update in range(updates):
             view = views[int(torch.randint(len(views), (), generator=draws))]

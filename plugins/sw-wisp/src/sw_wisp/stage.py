@@ -64,8 +64,8 @@ class WispStage(Stage):
     4. ROUND    noise becomes soft rounding, soft rounding hard rounding
     5. FREEZE   the integers are fixed; the appearance network learns on
 
-    With `layers.progressive` splats get subsets at PLACE, some steps draw the first packets alone from then on, and
-    the order of packets is chosen before FREEZE.
+    With `layers.progressive` splats get subsets, some steps draw the first packets alone from then on, and the order of
+    packets is chosen before FREEZE.
     """
 
     name = "wisp"
@@ -156,6 +156,8 @@ class WispStage(Stage):
             scheduler.register_task(self.when(rate.start + rate.ramp), self.adapt, name="steps follow the networks")
         scheduler.register_task(self.when(list(phases.levels)), self.fix_levels, name="fix levels")
         scheduler.register_task(self.when(phases.cells), self.begin_jitter, name="draw positions anywhere in cells")
+        if self.config.layers.progressive:
+            scheduler.register_task(self.when(phases.subsets), self.form_subsets, name="form subsets")
         scheduler.register_task(self.when(phases.place), self.place, name="place splats in cells")
         soft = self.when(range(phases.soft, phases.hard))
         scheduler.register_task(soft, self.soften, name="soft rounding")
@@ -170,6 +172,9 @@ class WispStage(Stage):
             scheduler.register_task(self.when(phases.order), self.order_packets, name="order packets")
         scheduler.register_task(self.when(phases.freeze), self.freeze, name="fix integers")
         if self.config.layers.progressive and self.config.layers.train:
+            if self.config.layers.swell and self.config.layers.every:
+                fits = self.when(range(phases.prefixes, phases.freeze, self.config.layers.every))
+                scheduler.register_task(fits, self.fit_swell, name="swell subsets")
             drawn = self.when(range(phases.prefixes, self.config.FULL_ITERATIONS + 1))
             scheduler.register_task(drawn, self.draw_prefix, name="draw some packets alone")
 
@@ -258,8 +263,6 @@ class WispStage(Stage):
         model.levels, cells = model.cube.settled(model.means, model.levels, model.opacity)
         model.means.copy_(model.cube.centres(model.levels, cells))
         model.jitters = False
-        if self.config.layers.progressive:
-            self.split(model, cameras, rasterizer, scene.background.to(model.device))
         self.measure(model)
         self.fit(model, cameras, rasterizer, scene.background.to(model.device), "place")
 
@@ -316,19 +319,29 @@ class WispStage(Stage):
         log.scalar("pruned", len(doomed))
         log.scalar("added", added)
 
-    # Parts
-
-    def split(self, model: WispModel, views: list[View], rasterizer: Rasterizer, background: Tensor) -> None:
+    def form_subsets(self, model: WispModel, cameras: CameraIterator, rasterizer: Rasterizer, scene: Scene) -> None:
         """Put splats into the subsets of the file, those worth most for their bits into the first."""
         layers = self.config.layers
         with still(model):
-            found = self.worth(model, views, rasterizer, background)
+            found = self.worth(model, cameras, rasterizer, scene.background.to(model.device))
             forecast, drawn = model.predicted()
             places = model.place_bits().float()
         bits = packet_bits(drawn, forecast, places, layers.planes)
         whole = bits["base"] + bits["fine"] + bits["view"]
         model.subsets = split(found.squared_error, whole, bits["base"], model.levels, layers.shares)
         model.layers = Layers.of_subsets(len(layers.shares), layers.planes)
+        self.measure(model)
+
+    def fit_swell(
+        self, model: WispModel, cameras: CameraIterator, rasterizer: Rasterizer, scene: Scene, step: int
+    ) -> None:
+        """Find what size and opacity of subsets become while others are missing, as the splats stand."""
+        draws, background = stream(model.split_seed, f"swell/{step}"), scene.background.to(model.device)
+        with still(model):
+            swell = fitted_swell(model, cameras, rasterizer, background, self.config.layers.swell, draws)
+        model.layers = replace(model.layers, swell=swell)
+
+    # Parts
 
     def worth(self, model: SplatModel, views: list[View], rasterizer: Rasterizer, background: Tensor) -> Worth:
         """Return what each splat is worth to all training views."""
@@ -427,11 +440,9 @@ class WispStage(Stage):
         release(model)
         if model.layers.order:
             background = scene.background.to(model.device)
-            draws, updates = stream(model.split_seed, "swell"), self.config.layers.swell
+            if self.config.layers.swell:
+                self.fit_swell(model, CameraIterator(scene.train), self._rasterizer, scene, self.iterations)
             with still(model):
-                if updates:
-                    swell = fitted_swell(model, scene.train, self._rasterizer, background, updates, draws)
-                    model.layers = replace(model.layers, swell=swell)
                 psnr = psnr_of_prefixes(model, scene.train, self._rasterizer, background)
             model.layers = replace(model.layers, psnr=psnr)
         return model
