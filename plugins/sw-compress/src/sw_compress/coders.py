@@ -19,11 +19,12 @@ from torch import Tensor
 
 from splatwizard_core.api import GaussianModel, create_method
 from splatwizard_core.tooling import encode as encode_model
-from sw_codecs.models import precision, quantized
+from sw_codecs.models.band_context import suitable_classes
 from sw_codecs.models.position_grid import PositionGrid
 from sw_codecs.models.settings import QuantizedSettings
 from sw_codecs.positions import morton
-from sw_compress.rows import IMPORTANCE, like, select
+from sw_compress.rounding import Rounding, Steps, entropy_bits, equal_classes
+from sw_compress.rows import IMPORTANCE, select
 
 if TYPE_CHECKING:
     from splatwizard_core.api import PluginManager
@@ -96,21 +97,30 @@ class Quantized:
 
     def factors(self, model: GaussianModel) -> Tensor:
         """Multipliers of the steps of each Gaussian [N]; 1 where nothing says what it weighs."""
-        known = getattr(model, IMPORTANCE, None)
-        if known is None or not self.power:
+        if getattr(model, IMPORTANCE, None) is None or not self.power:
             return torch.ones(model.num_rows, device=model.device)
-        classes = precision.classes_of(known.detach().cpu().double().numpy(), self.power)
-        return torch.from_numpy(precision.factors(classes)).to(model.device, torch.float32)
+        return self.rounding(model).factors.float()
 
     def finest(self, model: GaussianModel) -> dict[str, float]:
         """Levels at which nothing is lost that could be seen."""
         return {name: float(self.levels(name)[0]) for name in self.attributes(model)}
 
-    def rounded(self, model: GaussianModel, levels: Levels) -> GaussianModel:
-        """Return the Gaussians that a file of these levels decodes to."""
-        found = quantized.rounded(_unrounded(model, self.power), self.settings(levels), morton.sort)
-        return like(model, quantized.reconstruct(found).to(model.device))
+    def rounding(self, model: GaussianModel) -> Rounding:
+        """What rounds a model; that of the last one is kept while it is as it was."""
+        state = [self.power, *(getattr(model, name)._version for name in model.RAW)]
+        if not _last or _last[0][0]() is not model or _last[0][1] != state:
+            _last[:] = [(weakref.ref(model), state, Rounding(model, self.power, OWN_BASIS))]
+        return _last[0][2]
 
+    def rounded(self, model: GaussianModel, levels: Levels) -> GaussianModel:
+        """Return the Gaussians that a file of these levels decodes to, in the order of the model."""
+        return self.rounding(model).model_at(self.whole_steps(levels))
+
+    def whole_steps(self, levels: Levels) -> Steps:
+        """Steps and bits of the positions."""
+        return Steps(self.steps(levels), int(POSITION_BITS - levels[POSITIONS]))
+
+    @torch.no_grad()
     def sizes(self, model: GaussianModel) -> dict[str, NDArray[np.float64]]:
         """Bytes of each attribute at each of its levels, from entropies; nothing is coded."""
         count = model.num_rows
@@ -118,24 +128,16 @@ class Quantized:
         if count > SAMPLE:
             chosen = torch.randperm(count, generator=torch.Generator().manual_seed(0))[:SAMPLE].sort().values
             part = select(model, chosen.to(model.device))
-        names = [name for name in self.attributes(model) if name != POSITIONS]
-        unrounded = quantized.unrounded(part, self.power, OWN_BASIS)
-        found: dict[str, list[float]] = {name: [] for name in names}
-        order = np.zeros(0, np.int64)
-
-        def sort(cells: NDArray[np.int64]) -> NDArray[np.int64]:  # the same cells at each level
-            nonlocal order
-            order = order if len(order) else morton.sort(cells)
-            return order
-
-        for level in LEVELS:
-            levels = {POSITIONS: 0.0, **{name: min(level, float(self.levels(name)[-1])) for name in names}}
-            lattice = quantized.rounded(unrounded, self.settings(levels), sort)
-            rows = max(len(lattice.symbols), 1)
-            for name, bits in _bits(lattice).items():
-                if name in found and level <= self.levels(name)[-1]:
-                    found[name].append(bits * count / rows / 8)
-        return {POSITIONS: self._position_sizes(model), **{name: np.array(each) for name, each in found.items()}}
+        rounding = Rounding(part, self.power, OWN_BASIS)
+        scale = count / max(part.num_rows, 1)
+        sections = _Sections(rounding, suitable_classes(count), TABLE_BITS / scale)
+        found = {POSITIONS: self._position_sizes(model)}
+        for name in self.attributes(model):
+            if name != POSITIONS:
+                steps = [Steps({name: STEPS[name] * 2.0**level}, POSITION_BITS) for level in self.levels(name)]
+                found[name] = np.array([sections.bits(name, each) for each in steps]) * scale / 8
+        found["dc"] += sections.precision_bits() * scale / 8
+        return found
 
     def _position_sizes(self, model: GaussianModel) -> NDArray[np.float64]:
         finest = self.settings({**self.finest(model), POSITIONS: float(POSITION_LEVELS[0])})
@@ -159,24 +161,42 @@ class Quantized:
         return CodecChoice(name="gaussians-quantized", settings=numbers)
 
 
-_last: list[tuple[weakref.ref[GaussianModel], list[float], quantized.Unrounded]] = []
+_last: list[tuple[weakref.ref[GaussianModel], list[float], Rounding]] = []
 
 
-def _unrounded(model: GaussianModel, power: float) -> quantized.Unrounded:
-    """The model before it is rounded; that of the last one is kept while it is as it was."""
-    state = [power, *(getattr(model, name)._version for name in model.RAW)]
-    if not _last or _last[0][0]() is not model or _last[0][1] != state:
-        _last[:] = [(weakref.ref(model), state, quantized.unrounded(model, power, OWN_BASIS))]
-    return _last[0][2]
+class _Sections:
+    """Sections of a file that is not written: rows by class, as its codec parts them."""
 
+    def __init__(self, rounding: Rounding, count: int, table_bits: float) -> None:
+        self._rounding, self._count, self._table_bits = rounding, count, table_bits
+        device = rounding.factors.device
+        classes = np.zeros(rounding.rows, np.int64) if rounding.classes is None else rounding.classes
+        self._first = torch.from_numpy(classes.astype(np.int64)).to(device)
+        if rounding.classes is None:
+            self._first_count = 1
+        else:
+            self._first, self._first_count = equal_classes(self._first, count), count
 
-def _bits(lattice: quantized.Lattice) -> dict[str, float]:
-    """Bits of the columns of each attribute."""
-    names = {"color": "dc", "opacity": "opacity", "scales": "scale", "quats": "quat"}
-    found = dict.fromkeys(STEPS, 0.0)
-    for section, matrix in quantized.matrices(lattice):
-        found[names.get(section, "rest")] += columns_bits(matrix)
-    return found
+    def precision_bits(self) -> float:
+        """Bits of the classes themselves."""
+        if self._rounding.classes is None:
+            return 0.0
+        return columns_bits(self._rounding.classes[:, None])
+
+    def bits(self, name: str, steps: Steps) -> float:
+        """Bits of the columns of an attribute."""
+        symbols = self._rounding.symbols(name, steps).to(torch.int32)
+        if name != "rest":
+            return entropy_bits(symbols, self._first, self._first_count, self._table_bits)
+        total, activity = 0.0, torch.zeros_like(self._first)
+        classes, count = self._first, self._first_count
+        for degree in range(1, round((symbols.shape[1] // 3 + 1) ** 0.5)):
+            band = symbols[:, 3 * (degree**2 - 1) : 3 * ((degree + 1) ** 2 - 1)]
+            if degree > 1:
+                classes, count = equal_classes(activity, self._count), self._count
+            total += entropy_bits(band, classes, count, self._table_bits)
+            activity += band.abs().sum(1)
+        return total
 
 
 def columns_bits(symbols: NDArray[np.int32]) -> float:

@@ -34,14 +34,17 @@ class Errors:
         finest = coder.finest(model)
         self._measured: dict[str, tuple[list[float], list[float]]] = {}
         with track("measure precision", total=1 + len(names) * len(MEASURED), unit="models") as bar:
-            self.floor = pictures.error(coder.rounded(model, finest))
+            rounding = coder.rounding(model)
+            whole = rounding.model_at(coder.whole_steps(finest))
+            self.floor = pictures.error(whole)
             bar.advance()
             for name in names:
                 levels, logs = list[float](), list[float]()
                 for level in (*MEASURED, *COARSER):
                     if level > coder.levels(name)[-1] or (level not in MEASURED and 2.0 ** logs[-1] > SMALL):
                         continue
-                    error = pictures.error(coder.rounded(model, {**finest, name: level})) - self.floor
+                    changed = rounding.changed(whole, name, coder.whole_steps({**finest, name: level}))
+                    error = pictures.error(changed) - self.floor
                     levels, logs = [*levels, level], [*logs, float(np.log2(max(error, 1e-14)))]
                     bar.advance(level in MEASURED)
                 self._measured[name] = levels, logs

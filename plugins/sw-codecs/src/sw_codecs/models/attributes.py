@@ -99,7 +99,8 @@ def ready(values: Values, factors: Array | None = None, own_basis: bool = False)
     basis = None
     if own_basis and values.rest.size:
         rest = values.rest.reshape(len(logits), -1)
-        found = sh_basis.fit(_parts(rest), factors)
+        some = slice(None, None, sh_basis.stride(len(rest)))
+        found = sh_basis.fit(_parts(rest[some]), factors[some])
         basis = found, np.concatenate([found.to(part).astype(np.float32) for part in _parts(rest)])
     return Ready(to_luma(values.dc), logits, log_scales, quats[:, 1:], values.rest, factors, basis)
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 # Right-multiplication by these unit quaternions permutes the local axes (up to signs, which the covariance does not
 # see): column j of the turned frame is column PERMUTATION[i][j] of the old one.
 _HALF = np.sqrt(0.5)
-_PERMUTATIONS = {
+PERMUTATIONS = {
     (0, 1, 2): (1.0, 0.0, 0.0, 0.0),
     (1, 2, 0): (0.5, 0.5, 0.5, 0.5),
     (2, 0, 1): (0.5, -0.5, -0.5, -0.5),
@@ -59,7 +59,7 @@ def canonical(log_scales: NDArray[Any], quats: NDArray[Any]) -> tuple[NDArray[np
     q = np.where(norm > 1e-12, q / np.maximum(norm, 1e-12), np.array([1.0, 0.0, 0.0, 0.0]))
     order = np.argsort(-scales, axis=1, kind="stable")  # [N,3]
     turn = np.zeros_like(q)
-    for permutation, quat in _PERMUTATIONS.items():
+    for permutation, quat in PERMUTATIONS.items():
         turn[(order == permutation).all(axis=1)] = quat
     q = multiply(q, turn)
     candidates = np.stack([multiply(q, np.asarray(half)) for half in _HALF_TURNS])  # [4,N,4]

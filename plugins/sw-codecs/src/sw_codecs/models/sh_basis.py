@@ -18,6 +18,8 @@ from sw_codecs.models.luma import COLOR
 
 UNIT = 127
 """Stored for a 1."""
+ENOUGH = 1 << 18
+"""Rows that a basis is fitted to, evenly taken from more: some thousand covariances are well known from these."""
 
 Array = NDArray[np.float64]
 
@@ -44,6 +46,11 @@ class Basis:
         return bool(count * (without - within) > 8 * self.matrix.size)
 
 
+def stride(rows: int) -> int:
+    """Of so many rows every n-th is fitted to."""
+    return max(1, rows // ENOUGH)
+
+
 def fit(parts: Sequence[NDArray[Any]], factors: Array) -> Basis:
     """Return the basis of some coefficients.
 
@@ -56,7 +63,12 @@ def fit(parts: Sequence[NDArray[Any]], factors: Array) -> Basis:
         start, end = end, end + len(part)
         scaled = part / factors[start:end, None]
         covariance += scaled.T @ scaled
-    covariance /= max(end, 1)
+    return of_covariance(covariance / max(end, 1))
+
+
+def of_covariance(covariance: Array) -> Basis:
+    """Return the basis of coefficients with this covariance [K,K], of what they are in the steps of their rows."""
+    width = len(covariance)
     vectors = np.linalg.eigh(covariance)[1][:, ::-1].T
     largest = np.take_along_axis(vectors, np.abs(vectors).argmax(axis=1)[:, None], axis=1)
     matrix = np.rint(UNIT * vectors * np.sign(largest)).astype(np.int8)

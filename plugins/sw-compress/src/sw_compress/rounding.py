@@ -1,0 +1,244 @@
+"""A model as its file will decode at any levels, on the device that it is on, and the integers that the file holds.
+
+The arithmetic is that of the codec `gaussians-quantized`, number by number, but the rows stay in the model's order and
+one attribute can change alone: a search draws a dozen of such models, and codes none of them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from splatwizard_core.api import GaussianModel
+from sw_codecs.models import gauge, precision, sh_basis
+from sw_codecs.models.attributes import LARGEST_QUAT_STEP, MAX_LOGIT
+from sw_codecs.models.luma import COLOR
+from sw_codecs.models.position_grid import PositionGrid
+from sw_codecs.models.quantized import FAINTEST
+from sw_compress.rows import IMPORTANCE, like, select
+
+ROWS_AT_ONCE = 1 << 16
+"""Rows whose spherical harmonics are doubles at a time: those of all would be the largest thing in memory."""
+NAMES = {"means": "positions", "sh_dc": "dc", "opacity_logits": "opacity", "log_scales": "scale", "quats": "quat",
+         "sh_rest": "rest"}  # fmt: skip
+"""Parameter -> attribute that has a level."""
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Quantiser steps by attribute, and bits of the positions."""
+
+    of: Mapping[str, float]
+    bits: int
+
+
+class Rounding:
+    """Rounds the parameters of a model, of which those that can never be drawn are left out.
+
+    power       of the weight of a Gaussian by which its steps fall
+    own_basis   whether higher SH coefficients may have a basis of the scene's own
+    """
+
+    @torch.no_grad()
+    def __init__(self, model: GaussianModel, power: float, own_basis: bool) -> None:
+        drawn = model.opacity_logits >= FAINTEST
+        self.model = model if bool(drawn.all()) else select(model, drawn)
+        self.rows = self.model.num_rows
+        self.classes = self._classes_of(power)
+        device = model.device
+        factors = precision.factors(np.zeros(self.rows, np.int32) if self.classes is None else self.classes)
+        self.factors = torch.from_numpy(factors).to(device)
+        self._color = torch.from_numpy(COLOR).to(device)
+        self.grid = PositionGrid.fit(self.model.means.detach().cpu().numpy(), 1)
+        self.scales, self.xyz = canonical(self.model.log_scales.detach(), self.model.quats.detach())
+        self.basis = self._basis() if own_basis and self.rest.numel() else None
+
+    @property
+    def rest(self) -> Tensor:
+        """Higher SH coefficients that are in use [N,R,3]."""
+        return self.model.sh_rest.detach()[:, : (self.model.active_sh_degree + 1) ** 2 - 1]
+
+    def model_at(self, steps: Steps) -> GaussianModel:
+        """The model as a file of these steps decodes to."""
+        raw = {parameter: self.parameter(name, steps) for parameter, name in NAMES.items()}
+        return like(self.model, type(self.model)(**raw, active_sh_degree=self.model.active_sh_degree))
+
+    def changed(self, whole: GaussianModel, name: str, steps: Steps) -> GaussianModel:
+        """A model that was rounded, with one attribute at other steps."""
+        raw = {each: getattr(whole, each).detach() for each in whole.RAW}
+        raw |= {parameter: self.parameter(name, steps) for parameter, each in NAMES.items() if each == name}
+        return like(self.model, type(self.model)(**raw, active_sh_degree=self.model.active_sh_degree))
+
+    @torch.no_grad()
+    def parameter(self, name: str, steps: Steps) -> Tensor:
+        """Values of an attribute, rounded, float32 in the shape of its parameter."""
+        if name == "positions":
+            return on_grid(self.model.means.detach(), replace(self.grid, bits=steps.bits))
+        if name == "rest":
+            found = torch.zeros_like(self.model.sh_rest)
+            matrix = None if not self._has_basis(steps) else self._matrix()
+            width = self.rest.shape[1]
+            for start, symbols in self._rest_symbols(steps, matrix):
+                part = slice(start, start + len(symbols))
+                scale = steps.of["rest"] * self.factors[part]
+                if matrix is None:
+                    values = (symbols.reshape(len(symbols), width, 3) * scale[:, None, None]) @ self._color
+                else:
+                    scale = steps.of["rest"] / sh_basis.UNIT * self.factors[part]
+                    values = ((symbols @ matrix) * scale[:, None]).reshape(len(symbols), width, 3)
+                found[part, :width] = values.float()
+            return found
+        symbols, widths = self.symbols(name, steps), self._widths(name, steps)[:, None]
+        if name == "dc":
+            return ((symbols * widths) @ self._color).float()[:, None, :]
+        if name == "quat":
+            return _complete(symbols * widths).float()
+        values = (symbols * widths).float()
+        return values[:, 0] if name == "opacity" else values
+
+    @torch.no_grad()
+    def symbols(self, name: str, steps: Steps) -> Tensor:
+        """Integers [N,C] that the file holds, float64."""
+        if name == "rest":
+            matrix = self._matrix() if self._has_basis(steps) else None
+            return torch.cat([part for _, part in self._rest_symbols(steps, matrix)])
+        widths = self._widths(name, steps)[:, None]
+        if name == "dc":
+            return (self.model.sh_dc.detach()[:, 0].double() @ self._color.T / widths).round_()
+        if name == "opacity":
+            logits = self.model.opacity_logits.detach().double().clamp(-MAX_LOGIT, MAX_LOGIT)
+            return (logits[:, None] / widths).round_()
+        return ((self.scales if name == "scale" else self.xyz) / widths).round_()
+
+    def _widths(self, name: str, steps: Steps) -> Tensor:
+        """Step of each row [N]."""
+        found = steps.of[name] * self.factors
+        return found.clamp_max(max(steps.of[name], LARGEST_QUAT_STEP)) if name == "quat" else found
+
+    def _classes_of(self, power: float) -> np.ndarray | None:
+        if power <= 0:
+            return None
+        known = getattr(self.model, IMPORTANCE, None)
+        if known is not None:
+            weights = known.detach().cpu().double().numpy()
+        else:
+            arrays = (getattr(self.model, name).detach().cpu().numpy() for name in ("opacity_logits", "log_scales"))
+            weights = precision.footprints(*arrays)
+        return precision.classes_of(weights, power)
+
+    def _basis(self) -> sh_basis.Basis:
+        some = slice(None, None, sh_basis.stride(self.rows))
+        scaled = self.rest.reshape(self.rows, -1)[some].double() / self.factors[some, None]
+        return sh_basis.of_covariance((scaled.T @ scaled / max(len(scaled), 1)).cpu().numpy())
+
+    def _has_basis(self, steps: Steps) -> bool:
+        return self.basis is not None and self.basis.pays(self.rows, steps.of["rest"])
+
+    def _matrix(self) -> Tensor:
+        assert self.basis is not None  # the caller has looked
+        return torch.from_numpy(self.basis.matrix.astype(np.float64)).to(self.factors.device)
+
+    def _rest_symbols(self, steps: Steps, matrix: Tensor | None) -> Iterator[tuple[int, Tensor]]:
+        """First row and integers [n,3R] of some rows at a time, in the basis or as luma and chroma."""
+        inverse = None if matrix is None else torch.linalg.inv(matrix / sh_basis.UNIT)
+        for start in range(0, self.rows, ROWS_AT_ONCE):
+            part = self.rest[start : start + ROWS_AT_ONCE].double()
+            if inverse is None:
+                values = (part @ self._color.T).reshape(len(part), -1)
+            else:
+                values = (part.reshape(len(part), -1) @ inverse).float().double()  # as the codec keeps them
+            yield start, (values / (steps.of["rest"] * self.factors[start : start + len(part)])[:, None]).round_()
+
+
+def on_grid(points: Tensor, grid: PositionGrid) -> Tensor:
+    """Centres [N,3] float32 of the cells of points [N,3]."""
+    center, width, top = (torch.tensor(each, dtype=torch.float64, device=points.device)
+                          for each in (grid.center, grid.width, grid.top))  # fmt: skip
+    found = torch.empty_like(points, dtype=torch.float32)
+    for start in range(0, len(points), ROWS_AT_ONCE):
+        u = (points[start : start + ROWS_AT_ONCE].double() - center) / width
+        away = u.abs()
+        mantissa, exponent = torch.frexp(away.clamp_min(1.0))
+        v = torch.where(away < 1.0, away, exponent + 2 * mantissa - 1.0).copysign(u)
+        cells = ((v + top) / (2 * top) * 2.0**grid.bits).floor().clamp(0, 2**grid.bits - 1)
+        v = (cells + 0.5) * (2 * top * 2.0**-grid.bits) - top
+        away = v.abs()
+        octave = away.clamp_min(1.0).floor()
+        u = torch.where(away < 1.0, away, torch.ldexp(1.0 + (away - octave), octave - 1)).copysign(v)
+        found[start : start + len(u)] = (u * width + center).float()
+    return found
+
+
+_TURNS = torch.zeros(27, 4, dtype=torch.float64)
+for _order, _quat in gauge.PERMUTATIONS.items():
+    _TURNS[9 * _order[0] + 3 * _order[1] + _order[2]] = torch.tensor(_quat, dtype=torch.float64)
+_PLACES = torch.tensor([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]])
+_SIGNS = torch.tensor([[1.0, 1, 1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1], [-1, 1, -1, 1]], dtype=torch.float64)
+"""A quaternion after each of the half turns: its components at these places, with these signs."""
+
+
+def canonical(log_scales: Tensor, quats: Tensor) -> tuple[Tensor, Tensor]:
+    """Log scales [N,3] in descending order, and x, y, z [N,3] of unit quaternions with w >= 1/2, float64.
+
+    As `sw_codecs.models.gauge.canonical`.
+    """
+    q = quats.double()
+    norm = q.square().sum(1, keepdim=True).sqrt()
+    unit = q.new_tensor([1.0, 0.0, 0.0, 0.0])
+    q = torch.where(norm > 1e-12, q / norm.clamp_min(1e-12), unit)
+    scales, order = torch.sort(log_scales.double(), dim=1, descending=True, stable=True)
+    w, x, y, z = _TURNS.to(q.device)[9 * order[:, 0] + 3 * order[:, 1] + order[:, 2]].unbind(1)
+    a, b, c, d = q.unbind(1)
+    q = torch.stack([
+        a * w - b * x - c * y - d * z, a * x + b * w + c * z - d * y,
+        a * y - b * z + c * w + d * x, a * z + b * y - c * x + d * w,
+    ], dim=1)  # fmt: skip
+    best = q.abs().argmax(1)
+    q = q.gather(1, _PLACES.to(q.device)[best]) * _SIGNS.to(q.device)[best]
+    return scales, torch.where(q[:, :1] < 0, -q, q)[:, 1:].contiguous()
+
+
+def _complete(xyz: Tensor) -> Tensor:
+    """Unit quaternions [N,4] of their x, y, z; longer ones than 1 are shortened, w = 0."""
+    squared = xyz[:, 0] ** 2 + xyz[:, 1] ** 2 + xyz[:, 2] ** 2
+    quats = torch.cat([(1.0 - squared).clamp_min(0.0).sqrt()[:, None], xyz], dim=1)
+    return quats / squared.clamp_min(1.0).sqrt()[:, None]
+
+
+def entropy_bits(symbols: Tensor, classes: Tensor, count: int, table_bits: float) -> float:
+    """Bits of integer columns, each by its own counts in each class, which are stored.
+
+    symbols     [n,C] int32
+    classes     [n] 0 .. count - 1
+    table_bits  of each distinct value, for its stored count
+    """
+    if not symbols.numel():
+        return 0.0
+    n, columns = symbols.shape
+    low, high = symbols.aminmax(dim=0)
+    # Where values are many, their low bits go raw; a matrix has few columns, so places fit 32 bits.
+    shift = torch.tensor([max(int(each).bit_length() - 12, 0) for each in (high - low).tolist()], dtype=torch.int32)
+    width = int(((high - low).cpu() >> shift).max()) + 1
+    places = (symbols - low).bitwise_right_shift_(shift.to(symbols.device))
+    places += (width * columns * classes.int())[:, None]
+    places += width * torch.arange(columns, dtype=torch.int32, device=places.device)
+    counts = torch.bincount(places.flatten(), minlength=width * columns * count).reshape(count, columns, width)
+    rows = counts.sum(2)
+    distinct = (counts > 0).sum(2)
+    own = torch.special.entr(counts.double()).sum(2) + torch.special.xlogy(rows.double(), rows.double())
+    bits = own / math.log(2) + table_bits * distinct * (distinct > 1)
+    return float(bits.sum() + (shift * n).sum())
+
+
+def equal_classes(values: Tensor, count: int) -> Tensor:
+    """Class 0 .. count - 1 of each of `values` [N], in classes of about equal size, as `band_context.equal_classes`."""
+    if count == 1 or not len(values):
+        return torch.zeros(len(values), dtype=torch.int64, device=values.device)
+    ordered = values.sort().values
+    limits = ordered[torch.tensor([len(ordered) * i // count for i in range(1, count)], device=values.device)]
+    return torch.searchsorted(limits.contiguous(), values.contiguous(), right=True)

@@ -1,0 +1,65 @@
+"""Rounding on the device of a model against the codec's own, and entropies against those of columns."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from sw_compress.coders import columns_bits
+from sw_compress.rounding import Rounding, Steps, canonical, entropy_bits, equal_classes, on_grid
+
+from sw_codecs.models import band_context, gauge
+from sw_codecs.models.position_grid import PositionGrid
+
+STEPS = Steps({"opacity": 0.2, "scale": 0.1, "quat": 0.05, "dc": 0.05, "rest": 0.04}, 12)
+
+
+def test_quaternions_and_scales_are_as_the_codec_turns_them():
+    random = np.random.default_rng(0)
+    scales, quats = random.normal(size=(500, 3)), random.normal(size=(500, 4))
+    scales[:20, 1] = scales[:20, 0]  # equal ones keep their order
+    quats[20] = 0
+    known_scales, known = gauge.canonical(scales, quats)
+    found_scales, found = canonical(torch.from_numpy(scales), torch.from_numpy(quats))
+    assert np.array_equal(known_scales, found_scales.numpy())
+    np.testing.assert_allclose(found.numpy(), known[:, 1:], atol=1e-14)
+
+
+def test_positions_lie_in_the_cells_of_the_codec():
+    points = np.random.default_rng(0).normal(size=(500, 3)).astype(np.float32)
+    points[:9] *= 1000
+    grid = PositionGrid.fit(points, 14)
+    assert np.array_equal(on_grid(torch.from_numpy(points), grid).numpy(), grid.dequantize(grid.quantize(points)))
+
+
+def test_one_attribute_changes_alone(ball):
+    rounding = Rounding(ball(300), 0.4, True)
+    whole = rounding.model_at(STEPS)
+    finer = replace(STEPS, of={**STEPS.of, "rest": 0.001})
+    changed = rounding.changed(whole, "rest", finer)
+    assert torch.equal(changed.sh_rest, rounding.model_at(finer).sh_rest)
+    assert not torch.equal(changed.sh_rest, whole.sh_rest)
+    assert changed.quats.data_ptr() == whole.quats.data_ptr()
+
+
+@pytest.mark.parametrize("spread", [0, 3, 40_000])
+def test_entropies_are_those_of_each_class(spread: int):
+    random = np.random.default_rng(0)
+    symbols = random.integers(-spread, spread + 1, (5000, 3)).astype(np.int32)
+    classes = random.integers(0, 4, 5000)
+    known = sum(columns_bits(symbols[classes == k]) for k in range(4))
+    found = entropy_bits(torch.from_numpy(symbols), torch.from_numpy(classes), 4, 3.0)
+    assert found == pytest.approx(known, rel=2e-3)
+
+
+def test_classes_are_as_large_as_those_of_the_codec():
+    values = np.random.default_rng(0).integers(0, 50, 1000)
+    assert np.array_equal(equal_classes(torch.from_numpy(values), 8).numpy(), band_context.equal_classes(values, 8))
+
+
+@pytest.mark.cuda
+def test_a_gpu_rounds_alike(ball):
+    on_cpu, on_gpu = (Rounding(ball(2000).to(device), 0.4, True).model_at(STEPS) for device in ("cpu", "cuda"))
+    for name in on_cpu.RAW:
+        different = (getattr(on_cpu, name) - getattr(on_gpu, name).cpu()).abs() > 1e-5
+        assert float(different.float().mean()) < 1e-3, name  # a value between two steps may fall on either side
