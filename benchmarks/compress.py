@@ -15,10 +15,11 @@ import json
 import sys
 import time
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import torch
-from sw_compress import coders, search
+from sw_compress import coders, reducing, search
 from sw_compress.compressing import compress
 from sw_compress.quality import Pictures
 from sw_compress.source import open_source
@@ -38,8 +39,11 @@ LARGEST_QUALITY = 69.0
 """dB; `sw compress` takes no more."""
 
 
-PARTS = {"precision": ("PRECISION_POWER", 0.0), "basis": ("OWN_BASIS", False), "pruning": ("SHARES", (1.0,))}
-"""Parts that `--without` takes away, each as a constant of sw-compress and its value without."""
+PARTS: dict[str, tuple[ModuleType, str, Any]] = {
+    "precision": (coders, "PRECISION_POWER", 0.0), "basis": (coders, "OWN_BASIS", False),
+    "fewer": (search, "SHARES", (1.0,)), "merging": (reducing, "PRUNED", 1.0), "pruning": (reducing, "PRUNED", 0.0),
+}  # fmt: skip
+"""Parts that `--without` takes away, each as a constant of sw-compress and its value without; `fewer`: all stay."""
 
 
 def compared(path: Path, device: str, baselines: list[str]) -> list[dict[str, Any]]:
@@ -96,8 +100,8 @@ def main() -> None:
     parser.add_argument("--without", action="append", choices=PARTS, default=[], help="without a part of sw compress")
     given = parser.parse_args()
     for part in given.without:
-        name, value = PARTS[part]
-        setattr(search if part == "pruning" else coders, name, value)
+        module, name, value = PARTS[part]
+        setattr(module, name, value)
     print("scene        gaussians file                bytes  quality |        ours quality    gaussians | ratio | time")
     rows = [row for path in given.scenes for row in compared(path, given.device, given.of or list(BASELINES))]
     for name in BASELINES:

@@ -19,6 +19,7 @@ from sw_compress.formats import FORMATS, FormatFile, format_file
 from sw_compress.measuring import Errors
 from sw_compress.pruning import Pruning
 from sw_compress.quality import PHOTOGRAPHS, Pictures, loss_against_photographs, told_loss
+from sw_compress.reducing import Reduction
 from sw_compress.refining import Refined, refine
 from sw_compress.rows import IMPORTANCE, with_degree
 from sw_compress.search import Choice, Search, for_quality, measured_again
@@ -113,8 +114,9 @@ def compress(
         held_out = Pictures(source.model, seen.held_out, rasterizer, options)
     keeps_unseen = not drop_unseen and given is None and gaussians is None
     pruning = Pruning(model, seen.fit, rasterizer, keeps_unseen=keeps_unseen)
+    reduction = Reduction(model, pruning)
     work = _Work(
-        source, model, judge, held_out, pruning, seen.fit, rasterizer, refine, target, gaussians, stages, plugins, say
+        source, model, judge, held_out, reduction, seen.fit, rasterizer, refine, target, gaussians, stages, plugins, say
     )
     make = _make_swz if format == SWZ else _make_other(format)
     if out is not None:
@@ -136,9 +138,9 @@ def compress(
         **facts,
         "gaussians": made.num_rows,
         "left_out": source.read - source.model.num_rows,
-        "pruned": source.model.num_rows - made.num_rows,
-        "merged": 0,
-        "unseen": pruning.unseen,
+        "pruned": reduction.pruned(made.num_rows),
+        "merged": source.model.num_rows - made.num_rows - reduction.pruned(made.num_rows),
+        "unseen": int(pruning.unseen.sum()),
         "sh_degree": made.active_sh_degree,
         "antialiased": source.antialiased,
         "quality": found.as_dict(),
@@ -162,7 +164,7 @@ class _Work:
     model: GaussianModel
     judge: Pictures
     held_out: Pictures
-    pruning: Pruning
+    reduction: Reduction
     fit: list[Camera]
     rasterizer: NegotiatedRasterizer
     refine: float
@@ -176,10 +178,10 @@ class _Work:
 def _make_swz(work: _Work, path: Path) -> tuple[GaussianModel, dict[str, Any]]:
     coder = Quantized(work.plugins, work.source.raster, precise=work.model.num_rows >= PRECISE_FROM)
     with work.stages.timed("score"):
-        setattr(work.model, IMPORTANCE, work.pruning.importance)
+        setattr(work.model, IMPORTANCE, work.reduction.pruning.importance)
     with work.stages.timed("sensitivities"):
         errors = Errors(coder, work.model, work.judge)
-    search = Search(coder, work.model, work.pruning, work.judge, errors, work.gaussians)
+    search = Search(coder, work.model, work.reduction, work.judge, errors, work.gaussians)
     refined: Refined | None = None
 
     def better(choice: Choice) -> Choice:
@@ -219,7 +221,7 @@ def _make_other(name: str) -> Callable[[_Work, Path], tuple[GaussianModel, dict[
     def make(work: _Work, path: Path) -> tuple[GaussianModel, dict[str, Any]]:
         with work.stages.timed("search"):
             found: FormatFile = format_file(
-                name, work.model, work.pruning, work.judge, work.held_out, work.target, work.gaussians, work.plugins,
+                name, work.model, work.reduction, work.judge, work.held_out, work.target, work.gaussians, work.plugins,
                 antialiased=work.source.antialiased, say=work.say,
             )  # fmt: skip
         path.write_bytes(found.data)

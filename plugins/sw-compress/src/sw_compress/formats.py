@@ -14,12 +14,12 @@ import torch
 
 from splatwizard_core.api import ContainerReader, ContainerWriter, GaussianModel, UserInputError
 from sw_compress.quality import Pictures
-from sw_compress.rows import like, select, with_degree
+from sw_compress.rows import like, with_degree
 from sw_compress.targets import LEAST_SHARE, QUALITY_MARGIN, Target
 
 if TYPE_CHECKING:
     from splatwizard_core.api import PluginManager
-    from sw_compress.pruning import Pruning
+    from sw_compress.reducing import Reduction
 
 Settings = Mapping[str, Any]
 
@@ -60,15 +60,14 @@ class _Writer:
 
     name: str
     model: GaussianModel
-    pruning: Pruning
+    reduction: Reduction
     plugins: PluginManager
     antialiased: bool
     tried: list[dict[str, Any]] = field(default_factory=list)
 
     def file(self, count: int, settings: Settings, degree: int) -> FormatFile:
         """Write as many Gaussians as `count`, or as few as may stay."""
-        part = self.model if count >= self.model.num_rows else select(self.model, self.pruning.rows(count))
-        part = with_degree(part, degree)
+        part = with_degree(self.reduction.part(count), degree)
         codec = self.plugins.gaussian_codecs.load(self.name)(self.plugins, **settings)
         writer = ContainerWriter(self.name, 1, raster={"antialias": True} if self.antialiased else {})
         with torch.no_grad():
@@ -90,11 +89,11 @@ class _Writer:
 
 
 def format_file(
-    name: str, model: GaussianModel, pruning: Pruning, judge: Pictures, held_out: Pictures, target: Target,
+    name: str, model: GaussianModel, reduction: Reduction, judge: Pictures, held_out: Pictures, target: Target,
     count: int | None, plugins: PluginManager, *, antialiased: bool, say: Callable[[str], None],
 ) -> FormatFile:  # fmt: skip
     """The best file of a size, or the smallest of a quality. Raises UserInputError for a target out of reach."""
-    writer = _Writer(name, model, pruning, plugins, antialiased)
+    writer = _Writer(name, model, reduction, plugins, antialiased)
     whole = model.num_rows if count is None else min(count, model.num_rows)
     if target.size is not None:
         return _of_size(writer, whole, target.size, judge, say, fixed=count is not None)

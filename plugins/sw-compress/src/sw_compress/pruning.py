@@ -42,18 +42,27 @@ class Pruning:
         self, model: GaussianModel, cameras: Sequence[Camera], rasterizer: Rasterizer, *, keeps_unseen: bool = True
     ) -> None:
         self._model, self._cameras, self._rasterizer = model, list(cameras), rasterizer
-        self._keeps_unseen = keeps_unseen
+        self.keeps_unseen = keeps_unseen
         self._left = torch.arange(model.num_rows, device=model.device)
         self._gone: list[Tensor] = []
         self._costs, self._age = torch.zeros(0), ROUNDS_PER_SCORE
-        self.unseen, self._importance = 0, torch.zeros(0)
+        self._importance, self._unseen = torch.zeros(0), torch.zeros(0, dtype=torch.bool)
+
+    @property
+    def unseen(self) -> Tensor:
+        """Whether no camera shows a Gaussian [N]."""
+        self._judged()
+        return self._unseen
 
     @property
     def importance(self) -> Tensor:
         """Squared change of the pictures by that of a colour, of each Gaussian [N] while all are there."""
+        self._judged()
+        return self._importance
+
+    def _judged(self) -> None:
         if self._age == ROUNDS_PER_SCORE and not self._gone:
             self._score()
-        return self._importance
 
     def rows(self, count: int) -> Tensor:
         """Rows [M] int64, ascending, that are left where `count` shall be; more where the others may not go."""
@@ -96,8 +105,8 @@ class Pruning:
             )  # fmt: skip
         unseen = costs.scores["blend_max"] < SEEN
         if not self._gone:
-            self.unseen, self._importance = int(unseen.sum()), costs.scores["blend_sq"]
-        self._costs = torch.where(unseen, torch.inf if self._keeps_unseen else -1.0, costs.change)
+            self._importance, self._unseen = costs.scores["blend_sq"], unseen
+        self._costs = torch.where(unseen, torch.inf if self.keeps_unseen else -1.0, costs.change)
         self._age = 0
 
     def _among_neighbours(self, order: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ from sw_compress.rows import select
 from sw_compress.targets import QUALITY_MARGIN
 
 if TYPE_CHECKING:
-    from sw_compress.pruning import Pruning
+    from sw_compress.reducing import Reduction
 
 SHARES = (1.0, 0.8, 0.64, 0.5, 0.4, 0.3, 0.2, 0.14, 0.1, 0.05, 0.02)
 """Shares of the Gaussians that are tried, until it gets worse."""
@@ -43,7 +43,7 @@ class Search:
 
     coder: Quantized
     model: GaussianModel
-    pruning: Pruning
+    reduction: Reduction
     pictures: Pictures
     errors: Errors
     count: int | None = None
@@ -61,7 +61,7 @@ class Search:
     def part(self, count: int) -> tuple[GaussianModel, list[Curve]]:
         """The model with as many Gaussians as `count`, or as few as may stay, and its curves."""
         if count not in self._known:
-            part = self.model if count == self.model.num_rows else select(self.model, self.pruning.rows(count))
+            part = self.reduction.part(count)
             found = part, self.errors.curves(self.coder, part)
             if self.model.num_rows > KEPT:
                 return found

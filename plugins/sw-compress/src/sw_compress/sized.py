@@ -20,6 +20,7 @@ from sw_compress.filling import fill
 from sw_compress.measuring import Errors
 from sw_compress.pruning import Pruning
 from sw_compress.quality import Pictures
+from sw_compress.reducing import Reduction
 from sw_compress.rows import IMPORTANCE
 from sw_compress.search import Search
 from sw_compress.stages import Stages
@@ -78,7 +79,7 @@ class Sized:
         setattr(part, IMPORTANCE, pruning.importance)
         with torch.no_grad():
             errors = Errors(coder, part, judge)
-        search = Search(coder, part, pruning, judge, errors)
+        search = Search(coder, part, Reduction(part, pruning), judge, errors)
         with tempfile.TemporaryDirectory(prefix="sw-compress-") as folder:
             filled = fill(search, self._size, Path(folder) / "scene.swz", Stages(), say)
         return filled.choice.model, coder.choice(filled.choice.allocation.levels)

@@ -44,8 +44,20 @@ def merged_to(model: GaussianModel, count: int, *, significance: Tensor | None =
     The result is a new model without the SH bands that were not active; one that is small enough already is copied.
     Raises ShapeError for surfels.
     """
+    return _reduced(model, count, significance)[0]
+
+
+@torch.no_grad()
+def merged_by(model: GaussianModel, count: int, significance: Tensor) -> tuple[GaussianModel, Tensor]:
+    """As `merged_to`, with the significance of each Gaussian of the result: the sum over what it stands for."""
+    merged, weights = _reduced(model, count, significance)
+    assert weights is not None  # they were given
+    return merged, weights.to(significance) * significance.median().clamp_min(1e-30)
+
+
+def _reduced(model: GaussianModel, count: int, significance: Tensor | None) -> tuple[GaussianModel, Tensor | None]:
     splats = splats_of(model)
-    weights = None if significance is None else significance.to(splats.means) / significance.median().clamp_min(1e-30)
+    weights = None if significance is None else (significance / significance.median().clamp_min(1e-30)).to(splats.means)
     unit = _unit(splats)
     near, wave = NEAR, 0
     while (n := len(splats.means)) > max(count, 1):
@@ -57,7 +69,7 @@ def merged_to(model: GaussianModel, count: int, *, significance: Tensor | None =
             near *= 4
         splats, weights = _merged(splats, weights, pairs)
         wave += 1
-    return model_of(splats, model)
+    return model_of(splats, model), weights
 
 
 def level_counts(count: int, levels: int | None = None, *, smallest: int = 20_000) -> list[int]:
