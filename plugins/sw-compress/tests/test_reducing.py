@@ -4,6 +4,7 @@ import pytest
 import torch
 from sw_compress import reducing
 from sw_compress.pruning import Pruning
+from sw_compress.quality import Pictures
 from sw_compress.reducing import Reduction
 from sw_compress.rows import IMPORTANCE
 from sw_reference.rasterizer import ReferenceRasterizer
@@ -13,6 +14,7 @@ from sw_rasterizers.native import MODULE
 from sw_rasterizers.standard import StandardRasterizer
 
 RASTERIZER = StandardRasterizer() if MODULE.available() is None else ReferenceRasterizer()
+ALPHA = RasterOptions(alpha=True)
 UP = torch.tensor([0.0, -1.0, 0.0])
 CAMERAS = [
     Camera.look_at(torch.tensor(eye), torch.zeros(3), UP, width=48, height=48, fov_x=0.8)
@@ -42,7 +44,7 @@ def test_as_many_stay_as_are_asked_for(reduction: Reduction, count: int):
 
 
 def test_the_weight_of_what_merged_is_the_sum(reduction: Reduction, monkeypatch):
-    monkeypatch.setattr(reducing, "PRUNED", 0.0)  # nothing is removed
+    monkeypatch.setattr(reducing, "POWERS", (0.0,))  # nothing is removed
     assert reduction.pruned(100) == 0
     weights = reduction.pruning.importance
     floor = reducing.FAINTEST_WEIGHT * float(weights[weights > 0].median())
@@ -51,10 +53,12 @@ def test_the_weight_of_what_merged_is_the_sum(reduction: Reduction, monkeypatch)
     )
 
 
-def test_merging_after_pruning_is_better_than_pruning_alone(reduction: Reduction, monkeypatch):
-    both = error(reduction.part(100), reduction.model)
-    monkeypatch.setattr(reducing, "PRUNED", 1.0)
-    assert both < 0.8 * error(reduction.part(100), reduction.model)
+def test_what_is_better_is_chosen_by_pictures(reduction: Reduction):
+    alone = error(reduction.part(100), reduction.model)
+    reduction = Reduction(reduction.model, reduction.pruning, Pictures(reduction.model, CAMERAS, RASTERIZER, ALPHA))
+    assert error(reduction.part(100), reduction.model) < 0.8 * alone
+    assert reduction.pruned(100) < 200
+    assert reduction.pruned(299) == 1  # one removal in place of a merge
 
 
 def test_what_no_camera_shows_merges_as_if_it_were_of_middling_weight(ball):

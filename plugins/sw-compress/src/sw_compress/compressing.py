@@ -114,7 +114,7 @@ def compress(
         held_out = Pictures(source.model, seen.held_out, rasterizer, options)
     keeps_unseen = not drop_unseen and given is None and gaussians is None
     pruning = Pruning(model, seen.fit, rasterizer, keeps_unseen=keeps_unseen)
-    reduction = Reduction(model, pruning)
+    reduction = Reduction(model, pruning, judge)
     work = _Work(
         source, model, judge, held_out, reduction, seen.fit, rasterizer, refine, target, gaussians, stages, plugins, say
     )

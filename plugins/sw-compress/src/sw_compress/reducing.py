@@ -1,58 +1,81 @@
 """Fewer Gaussians for the same pictures: what matters least goes, then neighbours merge.
 
-Each does half of it, by equal factors. Removals alone take away light, and it adds up; merging alone blurs what a
-removal would hardly have changed. At half of the Gaussians both together are 2 to 3 dB better than removals alone.
+Removals alone take away light, and it adds up; merging alone blurs what a removal would hardly have changed. How much
+is done by each is chosen by pictures: the fewer stay, the more merge.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import torch
 from sw_gaussians.simplifying import merged_by
 
 from splatwizard_core.api import GaussianModel
-from sw_compress.pruning import Pruning
 from sw_compress.rows import IMPORTANCE, like, select
 
-PRUNED = 0.5
-"""1: nothing merges. Power of the share of the Gaussians that stays when what matters least has gone."""
+if TYPE_CHECKING:
+    from sw_compress.pruning import Pruning
+    from sw_compress.quality import Pictures
+
+POWERS = (1.0, 0.75, 0.5, 0.25)
+"""Power of the share of the Gaussians that is left by removals, in the order of trying; 1: nothing merges."""
 FAINTEST_WEIGHT = 1e-4
 """Of a Gaussian that is shown, in medians: prices of merging shall not be ruled by those that hardly are."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Reduction:
     """A model with fewer Gaussians, however many are asked for.
 
     pruning     of that model
+    pictures    of its source, that choose; None: the first of the powers is taken
     """
 
     model: GaussianModel
     pruning: Pruning
+    pictures: Pictures | None = None
+    _chosen: dict[int, int] = field(default_factory=dict)
 
     @torch.no_grad()
     def part(self, count: int) -> GaussianModel:
-        """The model with `count` Gaussians, and what each weighs."""
-        whole = self.model.num_rows
-        if count >= whole:
+        """The model with `count` Gaussians, or without merging as few as may stay, and what each weighs."""
+        if count >= self.model.num_rows:
             return self.model
-        rows = self.pruning.rows(self._kept(count))
+        place = self._chosen.get(
+            count, self._chosen[min(more)] if (more := [n for n in self._chosen if n > count]) else 0
+        )
+        best, known = self._by(count, POWERS[place]), count in self._chosen
+        if self.pictures is not None and not known:
+            error = self.pictures.error(best) if best.num_rows <= count else math.inf  # the others may not go
+            for power in POWERS[place + 1 :]:
+                found = self._by(count, power)
+                changed = self.pictures.error(found)
+                if changed >= error:
+                    break
+                best, error, place = found, changed, POWERS.index(power)
+        self._chosen[count] = place
+        return best
+
+    def pruned(self, count: int) -> int:
+        """How many were removed to come to so many; the others that are gone have merged."""
+        power = POWERS[self._chosen.get(count, 0)]
+        return self.model.num_rows - len(self.pruning.rows(self._kept(count, power)))
+
+    def _kept(self, count: int, power: float) -> int:
+        whole = self.model.num_rows
+        return max(count, round(whole * (count / whole) ** power))
+
+    def _by(self, count: int, power: float) -> GaussianModel:
+        rows = self.pruning.rows(self._kept(count, power))
         found, weights = select(self.model, rows), self.pruning.importance[rows]
-        if len(rows) > count and PRUNED < 1:  # at 1 more are left only where no others may go
+        if len(rows) > count and power < 1:
             merged, weights = merged_by(found, count, self._weights()[rows])
             found = like(self.model, merged)
         setattr(found, IMPORTANCE, weights)
         return found
-
-    def pruned(self, count: int) -> int:
-        """How many were removed on the way to so many; the others that are not there have merged."""
-        whole = self.model.num_rows
-        return whole - len(self.pruning.rows(self._kept(count)))
-
-    def _kept(self, count: int) -> int:
-        whole = self.model.num_rows
-        return max(count, round(whole * (count / whole) ** PRUNED))
 
     def _weights(self) -> torch.Tensor:
         """What each Gaussian weighs in pictures [N]; what none shows, and must not go, weighs as much as the median."""
@@ -60,5 +83,4 @@ class Reduction:
         shown = known[known > 0]
         median = shown.median() if len(shown) else known.new_ones(())
         weights = known.clamp_min(FAINTEST_WEIGHT * float(median))
-        unseen = self.pruning.unseen
-        return torch.where(unseen, median, weights) if self.pruning.keeps_unseen else weights
+        return torch.where(self.pruning.unseen, median, weights) if self.pruning.keeps_unseen else weights

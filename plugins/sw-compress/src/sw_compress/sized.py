@@ -79,7 +79,7 @@ class Sized:
         setattr(part, IMPORTANCE, pruning.importance)
         with torch.no_grad():
             errors = Errors(coder, part, judge)
-        search = Search(coder, part, Reduction(part, pruning), judge, errors)
+        search = Search(coder, part, Reduction(part, pruning, judge), judge, errors)
         with tempfile.TemporaryDirectory(prefix="sw-compress-") as folder:
             filled = fill(search, self._size, Path(folder) / "scene.swz", Stages(), say)
         return filled.choice.model, coder.choice(filled.choice.allocation.levels)
