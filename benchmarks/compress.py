@@ -41,7 +41,8 @@ LARGEST_QUALITY = 69.0
 
 PARTS: dict[str, tuple[ModuleType, str, Any]] = {
     "precision": (coders, "PRECISION_POWER", 0.0), "basis": (coders, "OWN_BASIS", False),
-    "fewer": (search, "SHARES", (1.0,)), "merging": (reducing, "POWERS", (1.0,)), "pruning": (reducing, "POWERS", (0.0,)),
+    "fewer": (search, "SHARES", (1.0,)),
+    "merging": (reducing, "POWERS", (1.0,)), "pruning": (reducing, "POWERS", (0.0,)),
 }  # fmt: skip
 """Parts that `--without` takes away, each as a constant of sw-compress and its value without; `fewer`: all stay."""
 

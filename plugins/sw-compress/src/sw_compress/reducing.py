@@ -44,10 +44,8 @@ class Reduction:
         """The model with `count` Gaussians, or without merging as few as may stay, and what each weighs."""
         if count >= self.model.num_rows:
             return self.model
-        place = self._chosen.get(
-            count, self._chosen[min(more)] if (more := [n for n in self._chosen if n > count]) else 0
-        )
-        best, known = self._by(count, POWERS[place]), count in self._chosen
+        place, known = self._place(count), count in self._chosen
+        best = self._by(count, POWERS[place])
         if self.pictures is not None and not known:
             error = self.pictures.error(best) if best.num_rows <= count else math.inf  # the others may not go
             for power in POWERS[place + 1 :]:
@@ -61,8 +59,13 @@ class Reduction:
 
     def pruned(self, count: int) -> int:
         """How many were removed to come to so many; the others that are gone have merged."""
-        power = POWERS[self._chosen.get(count, 0)]
-        return self.model.num_rows - len(self.pruning.rows(self._kept(count, power)))
+        kept = self._kept(count, POWERS[self._place(count)])
+        return self.model.num_rows - len(self.pruning.rows(kept))
+
+    def _place(self, count: int) -> int:
+        """Place of the power that was chosen for so many, or for the next larger number."""
+        more = [each for each in self._chosen if each >= count]
+        return self._chosen[min(more)] if more else 0
 
     def _kept(self, count: int, power: float) -> int:
         whole = self.model.num_rows
