@@ -106,7 +106,7 @@ class Quantized:
         return {name: float(self.levels(name)[0]) for name in self.attributes(model)}
 
     def rounding(self, model: GaussianModel) -> Rounding:
-        """What rounds a model; that of the last one is kept while it is as it was."""
+        """The rounding of a model; that of the last one is kept while it is as it was."""
         state = [self.power, *(getattr(model, name)._version for name in model.RAW)]
         if not _last or _last[0][0]() is not model or _last[0][1] != state:
             _last[:] = [(weakref.ref(model), state, Rounding(model, self.power, OWN_BASIS))]

@@ -81,7 +81,7 @@ class Reduction:
         return found
 
     def _weights(self) -> torch.Tensor:
-        """What each Gaussian weighs in pictures [N]; what none shows, and must not go, weighs as much as the median."""
+        """Weights of the Gaussians in pictures [N]; of what none shows, and must not go, as much as the median."""
         known = self.pruning.importance
         shown = known[known > 0]
         median = shown.median() if len(shown) else known.new_ones(())
