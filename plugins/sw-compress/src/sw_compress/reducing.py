@@ -58,7 +58,7 @@ class Reduction:
         return best
 
     def pruned(self, count: int) -> int:
-        """How many were removed to come to so many; the others that are gone have merged."""
+        """Count those removed to come to so many; the others that are gone have merged."""
         kept = self._kept(count, POWERS[self._place(count)])
         return self.model.num_rows - len(self.pruning.rows(kept))
 
