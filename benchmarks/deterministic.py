@@ -316,6 +316,7 @@ def operations(device: str) -> dict[str, Callable[[], list[Tensor]]]:
     from sw_anchors.fast.rows import add_rows
     from sw_anchors.fast.seen_rows import ExpectedRows
     from sw_anchors.fast.spawn import visible_gaussians
+    from sw_compact3dgs.seen_rows import SeenRows
     from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_scene
 
     from splatwizard_core.api import RasterOptions, photometric_loss
@@ -407,9 +408,8 @@ def operations(device: str) -> dict[str, Callable[[], list[Tensor]]]:
 
     def taken() -> list[Tensor]:
         table = features.detach().clone().requires_grad_()
-        found = table.index_select(0, rows % 60_000)
-        filled = table.new_zeros(200_000, 50).index_copy(0, rows, found)
-        return list(torch.autograd.grad(filled.square().sum(), [table]))
+        seen_rows = SeenRows(uniform < 0.3)
+        return list(torch.autograd.grad(seen_rows.put(seen_rows.take(table)).square().sum(), [table]))
 
     def loss() -> list[Tensor]:
         found = photometric_loss(picture, truth, lambda_dssim=0.2).total
@@ -430,7 +430,7 @@ def operations(device: str) -> dict[str, Callable[[], list[Tensor]]]:
         "networks of anchors": of_networks,
         "rows added": added,
         "rows expected, sampled": expected,
-        "index_select, index_copy": taken,
+        "seen rows (Compact3DGS)": taken,
         "residual VQ": lambda: list(torch.autograd.grad(vq.codebook_loss(shapes), [vq.codebooks])),
         "k-means": lambda: [
             kmeans(

@@ -14,6 +14,7 @@ from splatwizard_core.api import SH, GaussianInputs, stream
 from sw_codecs.quantizers.residual_quantizer import ResidualVectorQuantizer
 from sw_codecs.quantizers.straight_through import straight_through
 from sw_compact3dgs.mask_rate import MaskRate
+from sw_compact3dgs.seen_rows import SeenRows
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Camera, Rasterizer
@@ -32,11 +33,10 @@ def drawn(
 
     features    [N,F] of all Gaussians if they are known
     """
-    rows = torch.nonzero(rasterizer.visible_filter(inputs, camera) > 0).squeeze(1)  # [V]
-    means = inputs.means.index_select(0, rows)
-    found = color.features(means) if features is None else features.index_select(0, rows)
-    seen = color.coefficients(found, means, camera.center.to(means))
-    dc = seen.new_zeros(len(inputs), 3).index_copy(0, rows, seen)
+    rows = SeenRows(rasterizer.visible_filter(inputs, camera) > 0)
+    means = rows.take(inputs.means)
+    found = color.features(means) if features is None else rows.take(features)
+    dc = rows.put(color.coefficients(found, means, camera.center.to(means)))
     return replace(inputs, colors=None, sh=SH(dc=dc[:, None], active_degree=0))
 
 

@@ -94,8 +94,7 @@ class ResidualVectorQuantizer(nn.Module):
         books = self._fitted()
         symbols, found = self._search(x, books.detach())
         residual, loss = x.detach().to(books.dtype), books.new_zeros(())
-        for stage in range(self.stages):
-            entries = _rows(books[stage], symbols[:, stage])
+        for entries in _entries(books, symbols):
             loss = loss + (residual - entries).square().mean()
             residual = residual - entries.detach()
         return straight_through(x, found), loss
@@ -151,15 +150,17 @@ class ResidualVectorQuantizer(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *args)
 
 
-def _rows(book: Tensor, symbols: Tensor) -> Tensor:
-    """The entries of one stage [N, d]; differentiable.
+def _entries(books: Tensor, symbols: Tensor) -> tuple[Tensor, ...]:
+    """The entries [N, d] of each of S stages, differentiable: one sum for the gradients of all stages.
 
     On the CPU the gradient of an index is summed by several threads in any order; that of `index_select` is not, nor
-    on CUDA where algorithms must be deterministic, but there one entry after the other: `embedding` takes them apart.
+    on CUDA where algorithms must be deterministic, but there one entry after the other: `embedding` sorts them.
     """
-    if book.is_cuda and torch.are_deterministic_algorithms_enabled():
-        return functional.embedding(symbols, book)
-    return book.index_select(0, symbols)
+    stages, size, dim = books.shape
+    rows = symbols + size * torch.arange(stages, device=symbols.device)
+    if books.is_cuda and torch.are_deterministic_algorithms_enabled():
+        return functional.embedding(rows, books.view(-1, dim)).unbind(1)
+    return books.view(-1, dim).index_select(0, rows.view(-1)).view(-1, stages, dim).unbind(1)
 
 
 def _sum(books: Tensor, symbols: Tensor) -> Tensor:
