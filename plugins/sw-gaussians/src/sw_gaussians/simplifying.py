@@ -35,11 +35,14 @@ ROWS_AT_ONCE = {"cpu": 1 << 14, "cuda": 1 << 22}
 
 
 @torch.no_grad()
-def merged_to(model: GaussianModel, count: int, *, significance: Tensor | None = None) -> GaussianModel:
+def merged_to(
+    model: GaussianModel, count: int, *, significance: Tensor | None = None, widen: bool = False
+) -> GaussianModel:
     """Return the scene with at most `count` Gaussians, each wave merging pairs of neighbours.
 
     significance    [N] >= 0: what a squared error of colour of each costs in pictures; a price is multiplied by that of
                     its pair over the median. None: all alike
+    widen           as of `merge_groups`
 
     The result is a new model without the SH bands that were not active; one that is small enough already is copied.
     Raises ShapeError for surfels.
@@ -67,7 +70,7 @@ def _reduced(model: GaussianModel, count: int, significance: Tensor | None) -> t
         pairs = pairs[: min(n - count, math.ceil(TAKEN * len(pairs)))]
         if len(pairs) < min(ENOUGH * n, n - count):
             near *= 4
-        splats, weights = _merged(splats, weights, pairs)
+        splats, weights = _merged(splats, weights, pairs, widen)
         wave += 1
     return model_of(splats, model), weights
 
@@ -90,7 +93,7 @@ def levels_of(model: GaussianModel, levels: int | None = None) -> Iterator[Gauss
     """The scene itself, then ever coarser ones, each merged from the one before; see `level_counts`."""
     yield model
     for count in level_counts(model.num_rows, levels)[1:]:
-        model = merged_to(model, count)
+        model = merged_to(model, count, widen=True)
         yield model
 
 
@@ -172,10 +175,10 @@ def _lot(rows: Tensor, offset: int, wave: int) -> Tensor:
     return ((mixed ^ (mixed >> 13)) & 0xFFFF).float() / 65535
 
 
-def _merged(splats: Splats, weights: Tensor | None, pairs: Tensor) -> tuple[Splats, Tensor | None]:
+def _merged(splats: Splats, weights: Tensor | None, pairs: Tensor, widen: bool) -> tuple[Splats, Tensor | None]:
     left = torch.ones(len(splats.means), dtype=torch.bool, device=pairs.device)
     left[pairs.flatten()] = False
-    new = merge_groups(splats.rows(pairs)).to(splats.means.dtype)
+    new = merge_groups(splats.rows(pairs), widen=widen).to(splats.means.dtype)
     splats = Splats(*(torch.cat([old[left], more]) for old, more in zip(splats, new, strict=True)))
     if weights is not None:
         weights = torch.cat([weights[left], weights[pairs].sum(dim=1)])
