@@ -47,18 +47,20 @@ def merged_to(
     The result is a new model without the SH bands that were not active; one that is small enough already is copied.
     Raises ShapeError for surfels.
     """
-    return _reduced(model, count, significance)[0]
+    return _reduced(model, count, significance, widen)[0]
 
 
 @torch.no_grad()
 def merged_by(model: GaussianModel, count: int, significance: Tensor) -> tuple[GaussianModel, Tensor]:
     """As `merged_to`, with the significance of each Gaussian of the result: the sum over what it stands for."""
-    merged, weights = _reduced(model, count, significance)
+    merged, weights = _reduced(model, count, significance, widen=False)
     assert weights is not None  # they were given
     return merged, weights.to(significance) * significance.median().clamp_min(1e-30)
 
 
-def _reduced(model: GaussianModel, count: int, significance: Tensor | None) -> tuple[GaussianModel, Tensor | None]:
+def _reduced(
+    model: GaussianModel, count: int, significance: Tensor | None, widen: bool
+) -> tuple[GaussianModel, Tensor | None]:
     splats = splats_of(model)
     weights = None if significance is None else (significance / significance.median().clamp_min(1e-30)).to(splats.means)
     unit = _unit(splats)
