@@ -1,4 +1,4 @@
-"""What Gaussians weigh in pictures, and what pictures of fewer of them are wrong by, place by place."""
+"""Weights of Gaussians in pictures, and errors of pictures of fewer of them, place by place."""
 
 from __future__ import annotations
 
