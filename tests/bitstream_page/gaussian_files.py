@@ -14,6 +14,8 @@ from bitstream_page.entropy_models import categorical, columns
 from bitstream_page.fields import Bytes, check
 from bitstream_page.positions import byte_planes, deflate, float_delta, importance_vq, octree, residual_vq
 
+SECTIONS = ("positions", "color", "opacity", "scales", "quats", "sh1", "sh2", "sh3")
+
 
 def scales_of(static: dict[str, Any]) -> int:
     check(static.get("primitive", "surfel") == "surfel", "primitive")
@@ -41,21 +43,21 @@ def quantized(static: dict[str, Any], sections: dict[str, bytes]) -> dict[str, n
 
 
 def tiles(static: dict[str, Any], sections: dict[str, bytes]) -> dict[str, np.ndarray]:
-    check(sum(n for _, n, _ in static["groups"]) == static["num_gaussians"], "rows of the groups")
+    groups, base = static["groups"], static["base"]
+    check(static["first"] + sum(n for _, n, _ in groups) == static["num_gaussians"], "rows of the groups")
+    packets = max(int(name.partition("/")[0]) for name in sections) if sections else 0
+    last = {tile: number for number, (tile, _, _) in enumerate(groups[: max(packets - 1, 0)], 2)}
+    shown_base = [tile not in last for tile, n in enumerate(base) for _ in range(n)]
+    runs = [("1/", static["first"], [True] * static["first"]), ("1/stand-ins/", sum(base), shown_base)]
+    for number, (tile, n, m) in enumerate(groups[: max(packets - 1, 0)], 2):
+        runs += [(f"{number}/", n, [True] * n), (f"{number}/stand-ins/", m, [last[tile] == number] * m)]
     parts: list[dict[str, np.ndarray]] = []
-    last: dict[int, float] = {}
-    tile_of: list[int] = []
-    for number, (tile, n, g) in enumerate([(-1, sum(static["base"]), 0.0), *static["groups"]], 1):
-        part = {name.partition("/")[2]: data for name, data in sections.items() if name.startswith(f"{number}/")}
-        if part:
-            parts.append(quantized_rows({**static, "num_gaussians": n}, part))
-            tile_of += [tile] * n
-            last[tile] = g
-    base = [tile not in last for tile, n in enumerate(static["base"]) for _ in range(n)]
-    keep = np.array(base + [True] * (len(tile_of) - len(base)))
-    joined = {name: np.concatenate([part[name] for part in parts])[keep] for name in parts[0]}
-    grown = np.array([last[tile] for tile in tile_of], np.float32)[keep]
-    return {**joined, "log_scales": joined["log_scales"] + grown[:, None]}
+    for prefix, n, shown in runs:
+        if n:
+            part = {name: sections[prefix + name] for name in SECTIONS if prefix + name in sections}
+            rows = quantized_rows({**static, "num_gaussians": n}, part)
+            parts.append({name: values[np.array(shown)] for name, values in rows.items()})
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def quantized_rows(static: dict[str, Any], sections: dict[str, bytes]) -> dict[str, np.ndarray]:

@@ -218,6 +218,8 @@ def test_damage_is_refused(method, few):
     for key, value in hostile.items():
         with pytest.raises(BitstreamError):
             decoded(forged(data, **{key: value}))
+    with pytest.raises(BitstreamError, match="too large for"):
+        decoded(forged(data, resolution=250))
     for value in (np.nan, 1e38, 0.0):
         from splatwizard_core.coding.array_section import pack_array
 

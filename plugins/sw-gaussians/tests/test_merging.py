@@ -251,3 +251,14 @@ def test_a_window_that_is_none_is_refused():
     with pytest.raises(RuntimeError, match="a window of 0"):
         face.merge_partners(table=table, sh=sh, weights=None, window=0, wave=0, near=4.0, prices=torch.zeros(2, 0),
                             best=torch.zeros(2), partner=torch.zeros(2, dtype=torch.int64))  # fmt: skip
+
+
+def test_merged_gaussians_may_grow_where_opacity_does_not_suffice():
+    rng = torch.Generator().manual_seed(3)
+    means = torch.rand(400, 3, generator=rng)
+    opaque = GaussianModel.from_tensors(
+        means, torch.zeros(400, 1, 3), torch.zeros(400, 0, 3), torch.full((400,), 6.0), torch.full((400, 3), -3.0),
+        torch.tensor([[1.0, 0, 0, 0]]).repeat(400, 1),
+    )  # fmt: skip
+    cut, grown = (merged_to(opaque, 100, widen=widen) for widen in (False, True))
+    assert float(grown.scales.mean()) > 1.05 * float(cut.scales.mean())

@@ -1,8 +1,11 @@
-"""The file in tiles: each prefix a scene, the base where nothing finer has come, the whole one the scene."""
+"""The file in tiles: each prefix a scene, stand-ins for what has not come, the whole one the scene."""
+
+import itertools
 
 import numpy as np
 import pytest
 import torch
+from sw_gaussians.made_up_cameras import plausible_cameras
 from sw_gaussians.surfels import SurfelModel
 from sw_lod import write_lod
 from sw_lod.tiles import Tiles
@@ -12,10 +15,11 @@ from splatwizard_core.api import (
     ContainerReader,
     ContainerWriter,
     GaussianModel,
+    RasterOptions,
     ShapeError,
     UserInputError,
 )
-from splatwizard_core.tooling import Prefix, load_plugins
+from splatwizard_core.tooling import NegotiatedRasterizer, Prefix, load_plugins
 from sw_codecs.models.codecs import Quantized
 
 
@@ -31,7 +35,7 @@ def decoded(data: bytes, packets: int | None = None) -> GaussianModel:
 
 @pytest.fixture(scope="module")
 def data(model) -> bytes:
-    return encoded(model, rows=400, layers=2, coarsest=10)
+    return encoded(model, rows=400, layers=2, coarsest=10, stand_ins=10)
 
 
 def table(model: GaussianModel) -> torch.Tensor:
@@ -50,23 +54,52 @@ def test_the_whole_file_holds_what_one_without_packets_holds(data, model):
 
 def test_prefixes_grow_from_the_base(data):
     reader = ContainerReader(data)
-    base, groups = reader.static["base"], reader.static["groups"]
-    assert (len(base), len(groups), len(reader.cuts)) == (3, 6, 7)
-    assert decoded(data, 1).num_rows == sum(base) == pytest.approx(120, abs=12)
+    first, base, groups = (reader.static[name] for name in ("first", "base", "groups"))
+    assert (first, len(base), len(groups), len(reader.cuts)) == (24, 3, 6, 7)
+    assert decoded(data, 1).num_rows == first + sum(base) == pytest.approx(144, abs=12)
     for packets in range(2, 8):
         there = groups[: packets - 1]
-        begun = {tile for tile, _, _ in there}
-        rest = sum(n for tile, n in enumerate(base) if tile not in begun)
-        assert decoded(data, packets).num_rows == rest + sum(n for _, n, _ in there)
+        stand_ins = dict(enumerate(base)) | {tile: m for tile, _, m in there}
+        assert decoded(data, packets).num_rows == first + sum(n for _, n, _ in there) + sum(stand_ins.values())
 
 
-def test_a_tile_without_its_last_group_is_swollen(data, model):
-    _, rows, swell = ContainerReader(data).static["groups"][0]
-    assert swell > 0
-    some = decoded(data, 2).log_scales[-rows:]
-    whole = {tuple(row[:3]): row for row in torch.cat([decoded(data).means, decoded(data).log_scales], 1).tolist()}
-    grown = [whole[tuple(place)][3:] for place in decoded(data, 2).means[-rows:].tolist()]
-    assert torch.allclose(some, torch.tensor(grown) + swell, atol=1e-6)
+def test_what_stays_is_there_from_its_packet_on(data):
+    places = [{tuple(row) for row in decoded(data, packets).means.tolist()} for packets in range(1, 8)]
+    whole = places[-1]
+    for less, more in itertools.pairwise(places):
+        assert less & whole <= more
+
+
+def test_stand_ins_look_alike_from_all_sides(data):
+    whole = {tuple(row) for row in decoded(data).means.tolist()}
+    some = decoded(data, 1)
+    stands_in = torch.tensor([tuple(row) not in whole for row in some.means.tolist()])
+    assert stands_in.sum() > 100
+    assert not some.sh_rest[stands_in].any()
+    assert some.sh_rest[~stands_in].any()
+
+
+@torch.no_grad()
+def test_more_of_a_file_is_nearer_to_the_whole(data):
+    whole = decoded(data)
+    rasterizer = NegotiatedRasterizer(load_plugins(), device=torch.device("cpu"), options={})
+    cameras = plausible_cameras(whole, rasterizer, fit=1, held_out=3).held_out
+    pictures = [
+        [rasterizer.render(scene.gaussians(camera, rasterizer), camera, RasterOptions()).image for camera in cameras]
+        for scene in (whole, *(decoded(data, packets) for packets in (1, 3, 5)))
+    ]
+    base, some, most = (
+        sum(float((a - b).square().mean()) for a, b in zip(each, pictures[0], strict=True)) for each in pictures[1:]
+    )
+    assert base > 1.3 * some > 1.3 * 1.3 * most
+
+
+def test_a_scene_that_no_camera_sees_is_ordered_all_the_same(model):
+    faint = GaussianModel(**{name: getattr(model, name).detach().clone()[:30] for name in model.RAW})
+    faint.requires_grad_(False)
+    faint.opacity_logits.fill_(-5.4)
+    faint.log_scales.fill_(-30)
+    assert decoded(encoded(faint, rows=8)).num_rows == 30
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
@@ -86,8 +119,9 @@ def test_surfels_are_refused(model):
 @pytest.mark.parametrize(
     "change",
     [
-        {"base": [1, 2]}, {"base": [2**32 - 1] * 256}, {"num_gaussians": 2**32 - 1}, {"primitive": "surfel"},
-        {"groups": []}, {"groups": [[300, 1, 0.0]]}, {"packets": [[1200, 0.0]]}, {"base": -1},
+        {"base": [1, 2]}, {"base": [2**32 - 1] * 255}, {"num_gaussians": 2**32 - 1}, {"primitive": "surfel"},
+        {"groups": []}, {"groups": [[300, 1, 0]]}, {"packets": [[1200, 0.0]]}, {"base": -1}, {"first": 23},
+        {"first": 2**32 - 1},
     ],
 )  # fmt: skip
 def test_a_header_that_does_not_fit_is_refused(data, change):
@@ -97,9 +131,9 @@ def test_a_header_that_does_not_fit_is_refused(data, change):
         Tiles(load_plugins()).decode(reader)
 
 
-def test_a_last_group_that_stays_swollen_is_refused(data):
+def test_a_last_group_with_stand_ins_is_refused(data):
     reader = ContainerReader(data)
-    reader.static["groups"][-1][2] = 1.0
+    reader.static["groups"][-1][2] = 1
     with pytest.raises(BitstreamError, match="do not fit"):
         Tiles(load_plugins()).decode(reader)
 

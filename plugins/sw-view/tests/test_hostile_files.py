@@ -25,8 +25,8 @@ from sw_codecs.entropy.exact_tables import exact_tables
 ROOT = Path(__file__).parents[3]
 GOLDEN = ROOT / "tests" / "golden"
 MEMORY = 256 << 20
-SECONDS = 20
-"""Until a module is interrupted: damaged planes as large as a header may claim take seconds on a shared core."""
+SECONDS = 5
+"""Until a module is interrupted: a reason takes one at most on a core of its own."""
 FLIPS = int(os.environ.get("FUZZ", "40"))
 """Damaged files of each case; FUZZ=2000 for a hundred thousand of them, SEED for others."""
 VALUES = (-1, 0, 65535, 1 << 31, 1 << 62, 1e308, None, "x", [], {}, [0, 0, 0], [1 << 40] * 3, [4096] * 32)

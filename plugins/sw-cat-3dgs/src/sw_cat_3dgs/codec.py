@@ -28,7 +28,7 @@ from sw_anchors.sections import (
 )
 from torch import Tensor, nn
 
-from splatwizard_core.api import BitstreamError
+from splatwizard_core.api import BitstreamError, UserInputError
 from sw_cat_3dgs.context import PLANES, CatContext, ContextShape
 from sw_cat_3dgs.model import CatAnchors
 from sw_cat_3dgs.rate_model import CatRateModel, Predictor
@@ -45,6 +45,10 @@ LIMITS = {
     "resolution": 1 << 14,
 }  # fmt: skip
 
+PLANES_FREE, PLANES_PER_ANCHOR = 1 << 20, 1024
+"""Integers of the planes that a file may have, and those for each of its anchors besides: they cost hardly any bytes,
+so that a small file could keep its reader busy for long."""
+
 
 def encode(model: CatAnchors, writer: ContainerWriter, config: CatConfig, plugins: PluginManager) -> None:
     """Write all sections; the model stays as it is."""
@@ -53,6 +57,11 @@ def encode(model: CatAnchors, writer: ContainerWriter, config: CatConfig, plugin
     context = _settled_context(model, geometry, config)
     networks = {name: copy.deepcopy(getattr(model, name)).cpu() for name in model.NETWORKS} | _networks(context)
     round_networks(networks, config.codec.settings.weights)
+    if not _planes_fit(len(geometry.codes), context.shape, context.resolution):
+        raise UserInputError(
+            f"context.anchors_per_cell={config.context.anchors_per_cell}: planes of base {context.resolution} are too "
+            f"large for {len(geometry.codes):,} anchors; give a larger value"
+        )
     _write_shape(writer, context.shape, config, context.resolution)
     add_geometry(writer, geometry, plugins)
     add_networks(writer, networks, config.codec.settings.weights)
@@ -83,6 +92,10 @@ def decode(reader: ContainerReader, plugins: PluginManager) -> DecodedAnchors:
     reader.allow(decoded_bytes(n, shape, resolution), f"a model of {n:,} anchors and planes of base {resolution}")
     if (n > 0) != (resolution > 0):
         raise BitstreamError(f"{reader.name}: header gives {n:,} anchors planes of {resolution}", section="header")
+    if not _planes_fit(n, shape, resolution):
+        raise BitstreamError(
+            f"{reader.name}: planes of base {resolution} are too large for {n:,} anchors", section="header"
+        )
     geometry = read_geometry(reader, plugins, bytes_per_anchor=shape.decoded_bytes)
     model = DecodedAnchors.zeros(geometry, shape, hidden=hidden)
     context = CatContext(shape, torch.Generator())
@@ -141,8 +154,15 @@ def sections(shape: ContextShape) -> list[str]:
 
 def decoded_bytes(anchors: int, shape: ContextShape, resolution: int) -> int:
     """Bytes of the model in float32, with the planes that its decoder holds meanwhile."""
-    latents = sum(PLANES * c * h * w for c, h, w in shape.planes(resolution))
-    return anchors * shape.decoded_bytes + 4 * latents
+    return anchors * shape.decoded_bytes + 4 * _integers(shape, resolution)
+
+
+def _integers(shape: ContextShape, resolution: int) -> int:
+    return sum(PLANES * c * h * w for c, h, w in shape.planes(resolution))
+
+
+def _planes_fit(anchors: int, shape: ContextShape, resolution: int) -> bool:
+    return _integers(shape, resolution) <= PLANES_FREE + PLANES_PER_ANCHOR * anchors
 
 
 def _networks(context: CatContext) -> dict[str, nn.Module]:

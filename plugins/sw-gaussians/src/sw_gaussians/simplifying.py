@@ -35,27 +35,32 @@ ROWS_AT_ONCE = {"cpu": 1 << 14, "cuda": 1 << 22}
 
 
 @torch.no_grad()
-def merged_to(model: GaussianModel, count: int, *, significance: Tensor | None = None) -> GaussianModel:
+def merged_to(
+    model: GaussianModel, count: int, *, significance: Tensor | None = None, widen: bool = False
+) -> GaussianModel:
     """Return the scene with at most `count` Gaussians, each wave merging pairs of neighbours.
 
     significance    [N] >= 0: what a squared error of colour of each costs in pictures; a price is multiplied by that of
                     its pair over the median. None: all alike
+    widen           as of `merge_groups`
 
     The result is a new model without the SH bands that were not active; one that is small enough already is copied.
     Raises ShapeError for surfels.
     """
-    return _reduced(model, count, significance)[0]
+    return _reduced(model, count, significance, widen)[0]
 
 
 @torch.no_grad()
 def merged_by(model: GaussianModel, count: int, significance: Tensor) -> tuple[GaussianModel, Tensor]:
     """As `merged_to`, with the significance of each Gaussian of the result: the sum over what it stands for."""
-    merged, weights = _reduced(model, count, significance)
+    merged, weights = _reduced(model, count, significance, widen=False)
     assert weights is not None  # they were given
     return merged, weights.to(significance) * significance.median().clamp_min(1e-30)
 
 
-def _reduced(model: GaussianModel, count: int, significance: Tensor | None) -> tuple[GaussianModel, Tensor | None]:
+def _reduced(
+    model: GaussianModel, count: int, significance: Tensor | None, widen: bool
+) -> tuple[GaussianModel, Tensor | None]:
     splats = splats_of(model)
     weights = None if significance is None else (significance / significance.median().clamp_min(1e-30)).to(splats.means)
     unit = _unit(splats)
@@ -67,7 +72,7 @@ def _reduced(model: GaussianModel, count: int, significance: Tensor | None) -> t
         pairs = pairs[: min(n - count, math.ceil(TAKEN * len(pairs)))]
         if len(pairs) < min(ENOUGH * n, n - count):
             near *= 4
-        splats, weights = _merged(splats, weights, pairs)
+        splats, weights = _merged(splats, weights, pairs, widen)
         wave += 1
     return model_of(splats, model), weights
 
@@ -90,7 +95,7 @@ def levels_of(model: GaussianModel, levels: int | None = None) -> Iterator[Gauss
     """The scene itself, then ever coarser ones, each merged from the one before; see `level_counts`."""
     yield model
     for count in level_counts(model.num_rows, levels)[1:]:
-        model = merged_to(model, count)
+        model = merged_to(model, count, widen=True)
         yield model
 
 
@@ -172,10 +177,10 @@ def _lot(rows: Tensor, offset: int, wave: int) -> Tensor:
     return ((mixed ^ (mixed >> 13)) & 0xFFFF).float() / 65535
 
 
-def _merged(splats: Splats, weights: Tensor | None, pairs: Tensor) -> tuple[Splats, Tensor | None]:
+def _merged(splats: Splats, weights: Tensor | None, pairs: Tensor, widen: bool) -> tuple[Splats, Tensor | None]:
     left = torch.ones(len(splats.means), dtype=torch.bool, device=pairs.device)
     left[pairs.flatten()] = False
-    new = merge_groups(splats.rows(pairs)).to(splats.means.dtype)
+    new = merge_groups(splats.rows(pairs), widen=widen).to(splats.means.dtype)
     splats = Splats(*(torch.cat([old[left], more]) for old, more in zip(splats, new, strict=True)))
     if weights is not None:
         weights = torch.cat([weights[left], weights[pairs].sum(dim=1)])

@@ -72,7 +72,7 @@ def write_lod(
     counts = level_counts(model.num_rows, levels)
     scenes = [from_gaussians(model)]
     for level, count in enumerate(counts[1:], 1):
-        model = merged_to(model, count)
+        model = merged_to(model, count, widen=True)
         scenes.append(from_gaussians(model))
         say(f"level {level}: {count:,} Gaussians")
     merged = time.perf_counter()

@@ -212,25 +212,23 @@ def _by_class(symbols: NDArray[np.int32], classes: NDArray[np.int64], count: int
     return np.split(symbols[order], np.bincount(classes, minlength=count).cumsum()[:-1])
 
 
-def significant_first(
-    found: Lattice, count: int, smallest: float = SMALLEST_PREFIX
-) -> tuple[list[NDArray[np.int64]], list[float]]:
+def significant_first(found: Lattice, count: int) -> tuple[list[NDArray[np.int64]], list[float]]:
     """Return the rows of each of `count` packets, ascending in each, and how much log scales grow after it.
 
     The most significant come first: a Gaussian counts as much as it covers, opacity times the product of its two
     largest scales. The packets up to a place hold a share of all rows that grows by the same factor each time. Scales
     grow so that what is there covers as much as all will.
     """
-    covered = coverage(found)
+    covered = _coverage(found)
     order = np.argsort(-covered, kind="stable")
-    shares = [smallest ** (1 - number / count) for number in range(1, count + 1)]
+    shares = [SMALLEST_PREFIX ** (1 - number / count) for number in range(1, count + 1)]
     ends = [round(share * len(order)) for share in shares]
     packets = [np.sort(order[start:end]) for start, end in zip([0, *ends], ends, strict=False)]
     sums = np.cumsum(covered[order])
     return packets, [round(0.5 * math.log(sums[-1] / sums[end - 1]), 4) if end else 0.0 for end in ends]
 
 
-def coverage(found: Lattice) -> NDArray[np.float64]:
+def _coverage(found: Lattice) -> NDArray[np.float64]:
     """Area that each row covers: opacity times the product of its first two scales, relative to the largest product."""
     layout, symbols = found.layout, found.symbols.astype(np.float64)
     factors = np.ones(len(symbols)) if found.classes is None else precision.factors(found.classes)

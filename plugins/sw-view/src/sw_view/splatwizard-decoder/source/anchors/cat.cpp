@@ -10,6 +10,7 @@ namespace {
 
 constexpr int64_t OFFSET = 410;  // of step multipliers
 constexpr int64_t NUMBERS_AT_ONCE = 1 << 18;
+constexpr int64_t PLANES_FREE = 1 << 20, PLANES_PER_ANCHOR = 1024;  // sw_cat_3dgs.codec
 
 struct Sizes {
   Shape shape;
@@ -192,6 +193,8 @@ void decode_cat(Container& file) {
   file.allow_what(n * shape.decoded_bytes() + 4 * planes.integers(), "a model of ", grouped(n),
                   " anchors and planes of base ", sizes.resolution);
   if ((n > 0) != (sizes.resolution > 0)) refuse("header gives ", grouped(n), " anchors planes of ", sizes.resolution);
+  if (planes.integers() > PLANES_FREE + PLANES_PER_ANCHOR * n)
+    refuse("planes of base ", sizes.resolution, " are too large for ", grouped(n), " anchors");
   Geometry geometry;
   geometry.read_counts(file, shape);
   {
