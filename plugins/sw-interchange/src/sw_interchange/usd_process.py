@@ -10,7 +10,6 @@ numpy are imported, so that the process starts quickly.
 import json
 import math
 import posixpath
-import resource
 import sys
 from collections.abc import Iterator
 from typing import Any
@@ -32,9 +31,7 @@ class RefusedError(Exception):
 
 def main(path: str, megabytes: int, seconds: int) -> None:
     """Read a file within bounds on memory and time, and write what was found to standard output."""
-    resource.setrlimit(resource.RLIMIT_DATA, (megabytes << 20, megabytes << 20))
-    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    _bound(megabytes << 20, seconds)
     from pxr import Tf
 
     try:
@@ -48,6 +45,17 @@ def main(path: str, megabytes: int, seconds: int) -> None:
     out.write(json.dumps(told).encode() + b"\n")
     for array in arrays:
         out.write(array.data)
+
+
+def _bound(memory: int, seconds: int) -> None:
+    """Bound the memory, bytes, and the processor time of this process; Windows has no such limits."""
+    try:
+        import resource
+    except ImportError:
+        return
+    resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
+    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
 def _splats(path: str) -> tuple[dict[str, Any], list[Any]]:
