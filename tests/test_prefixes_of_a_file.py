@@ -98,7 +98,7 @@ def test_eval_measures_each_prefix_as_the_file_that_ends_there(capsys, tmp_path)
     assert plain["prefixes"] == told(capsys, "eval", PACKETS, *options)["prefixes"] == []
 
 
-def test_a_file_without_cuts_is_not_cut(capsys, tmp_path):
+def test_a_file_without_cuts_is_not_cut(capsys, caplog, tmp_path):
     plain, out = GOLDEN / "3dgs_r3_v1.swz", tmp_path / "x.swz"
     assert "declares no cuts" in refused(capsys, "truncate", plain, "--packets", 1, "--out", out)
     assert "declares no cuts" in refused(capsys, "truncate", plain, "--partial", "--out", out)
@@ -107,6 +107,7 @@ def test_a_file_without_cuts_is_not_cut(capsys, tmp_path):
     assert "4 packets, 5 are asked for" in refused(capsys, "decode", PACKETS, "--packets", 5)
     assert not out.exists()
     assert told(capsys, "decode", plain, "--partial", "--repeats", 0)["packets"] == 0
+    assert "it declares no cuts, so that --partial is of no use to it" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -88,6 +88,8 @@ ROWS = [
     Row("run --set seed=1 --seed 2", "--seed 2 contradicts --set seed=1"),
     Row("run --seed -1", "Invalid value for '--seed'"),
     Row("run --seed x", "'x' is not a valid integer"),
+    Row("run --gaussians 0", "Invalid value for '--gaussians': 0 is not in the range x>=1"),
+    Row("run --method 3dgs --scene demo:tiny --rate r1,r2 --size 1MB", "the same file, as size=1MB says it: give one"),
     Row("run --device tpu", "'tpu' is not one of 'auto', 'cpu', 'cuda'"),
     Row("run --repeats 0", "Invalid value for '--repeats'"),
     Row("decode {grey.swz} --repeats -1", "Invalid value for '--repeats'"),

@@ -221,6 +221,13 @@ def test_a_text_ply_is_read_too():
     assert values.tolist() == [7, 8]
 
 
+def test_sw_run_says_it_before_it_trains_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
+    monkeypatch.delenv(tmc3.VARIABLE, raising=False)
+    assert main(["run", "--scene", "demo:tiny", "--method", "gsc-quant,tmc13", "--out", str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err.startswith("error: method 'tmc13': not available: tmc13 needs MPEG's program tmc3")
+    assert not (tmp_path / "out").exists()
+
+
 def test_sw_encode_says_it_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
     from sw_gaussians.ply import export_ply
 

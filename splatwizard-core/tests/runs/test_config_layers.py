@@ -197,6 +197,8 @@ def opened(monkeypatch: pytest.MonkeyPatch, capsys):
     """(choices) -> the configurations of a training session of a scene with 1,000 x 1,000 pixels, and what was said."""
     from splatwizard_core.cli import setup
 
+    plugins = SimpleNamespace(methods=SimpleNamespace(entry=lambda name: SimpleNamespace(name=name, declared={})))
+
     def open_it(found, side: int = 1000, **chosen):
         camera = SimpleNamespace(width=side, height=side)
         scene = SimpleNamespace(train=[SimpleNamespace(camera=camera)])
@@ -204,7 +206,7 @@ def opened(monkeypatch: pytest.MonkeyPatch, capsys):
         monkeypatch.setattr(setup, "open_session", lambda resolved, plugins: session)
         monkeypatch.setattr("splatwizard_core.runs.device.device_reason", lambda *arguments: "on the CPU")
         monkeypatch.setattr(setup.Choices, "resolve", lambda choices, plugins: found(choices.preset))
-        configurations, _ = setup.open_training_session(setup.Choices(**chosen), None)
+        configurations, _ = setup.open_training_session(setup.Choices(**chosen), plugins)
         return configurations, capsys.readouterr().err.splitlines()
 
     return open_it

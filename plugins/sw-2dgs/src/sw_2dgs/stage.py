@@ -48,7 +48,7 @@ class TwoDGSStage(ThreeDGSStage):
         model = super().begin(context)
         if not isinstance(model, SurfelModel):
             raise ConfigError(
-                f"the stage '{self.name}' trains surfels, Gaussians with two scales, not a {type(model).__name__}"
+                f"stage '{self.name}' trains surfels, Gaussians with two scales; the given ones have three"
             )
         scene = context.scene
         self.surface = model.surface = self._configured(surface_of(scene.protocol.dataset, scene.name))

@@ -29,7 +29,7 @@ class FineTuneStage(FineTuningStage):
 
     def begin(self, context: StageContext) -> SplatModel:
         if not isinstance(context.model, GaussianModel):
-            raise SceneError(f"c3dgs starts from explicit Gaussians, not from a {type(context.model).__name__}")
+            raise SceneError("c3dgs starts from explicit Gaussians; those of the given scene depend on the camera")
         self.compress.seed = context.generator("method").initial_seed()
         self._rasterizer = context.rasterizer
         return SharedGaussians.of(context.model)

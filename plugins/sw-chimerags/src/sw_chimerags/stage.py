@@ -85,8 +85,8 @@ class MaskedDistillation(DistillationStage):
         model = super().begin(context)
         if not isinstance(model, GaussianModel):
             raise ConfigError(
-                f"train.method '{self.config.train.method}' trains a {type(model).__name__}: chimerags needs a method "
-                "of explicit Gaussians",
+                f"train.method '{self.config.train.method}' trains no explicit Gaussians: chimerags needs "
+                "a method that does",
                 key="train.method",
             )
         return MaskedGaussians.of(model, quantizer=self.quantizer, init=self.config.mask.init)

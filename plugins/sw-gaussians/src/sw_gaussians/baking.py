@@ -121,7 +121,7 @@ def _view(model: SplatModel, camera: Camera, rasterizer: Rasterizer) -> _View:
     if isinstance(model, NumbersGaussians):
         return _View(model.gaussian_ids(inputs), inputs, colors, camera)
     if len(inputs) != model.counts()["num_gaussians"]:
-        raise UserInputError(f"a {type(model).__name__} does not say which of its Gaussians a view draws")
+        raise UserInputError("this model does not say which of its Gaussians a view draws")
     return _View(torch.arange(len(inputs), device=colors.device), inputs, colors, camera)
 
 

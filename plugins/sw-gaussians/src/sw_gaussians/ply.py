@@ -73,7 +73,7 @@ def export_ply(model: SplatModel, path: str | os.PathLike[str]) -> None:
     """
     if not isinstance(model, GaussianModel):
         raise SceneError(
-            f"a {type(model).__name__} cannot be written as .ply: its Gaussians depend on the camera; "
+            "this model cannot be written as .ply: its Gaussians depend on the camera; "
             "`sw bake FILE OUT --scene SCENE` fits explicit ones",
             path=str(path),
         )

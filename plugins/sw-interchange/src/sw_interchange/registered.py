@@ -43,8 +43,7 @@ def _exporter(name: str, **options: Any) -> Callable[[SplatModel, Path], None]:
     def save(model: SplatModel, path: Path) -> None:
         if not isinstance(model, GaussianModel):
             raise SceneError(
-                f"a {type(model).__name__} cannot be written as {name}: its Gaussians depend on the camera",
-                path=str(path),
+                f"this model cannot be written as {name}: its Gaussians depend on the camera", path=str(path)
             )
         found, told = from_gaussians(model), os.path.basename(path)
         origin, shift = model.world_origin, model.world_shift

@@ -30,7 +30,7 @@ def _not_empty(_context: click.Context, parameter: click.Parameter, value: str |
     return value
 
 
-def _key(context: click.Context, parameter: click.Parameter, value: str | None) -> None:
+def _key(context: click.Context, parameter: click.Parameter, value: str | int | None) -> None:
     """Hand an option that stands for a key of its name to --set."""
     if value is not None:
         context.params["sets"] += (f"{parameter.name}={value}",)
@@ -142,7 +142,7 @@ def options(*decorators: Callable[[F], F]) -> Callable[[F], F]:
 size_options = options(  # of a training; a method takes those that are keys of its config
     click.option("--size", metavar="SIZE", expose_value=False, callback=_key,
                  help="Bytes of the file, never more: 5MB.  [default: as --rate says]"),
-    click.option("--gaussians", metavar="N", expose_value=False, callback=_key,
+    click.option("--gaussians", type=click.IntRange(min=1), metavar="N", expose_value=False, callback=_key,
                  help="Gaussians that the training makes at most.  [default: as the method's plan says]"),
 )  # fmt: skip
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
+import pkgutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from splatwizard_core.cli.options import say
-from splatwizard_core.errors import ConfigError, UserInputError
+from splatwizard_core.errors import CapabilityError, ConfigError, UserInputError
 
 TINY = 500_000  # pixels of all training pictures: the published plans take half an hour of a CPU for nothing
 
@@ -281,15 +282,31 @@ def open_training_session(chosen: Choices, plugins: PluginManager) -> tuple[list
 
     chosen = chosen.of_start()
     resolved = chosen.resolve(plugins)
-    _warn_of_equal_rates(resolved)
+    _refuse_unavailable(resolved, plugins)
+    _tell_equal_rates(resolved)
     session = open_session(resolved[0], plugins)
     resolved = chosen.settled(resolved, plugins, session.scene)
     say(device_reason(resolved[0].ppl.device, session.device, plugins))
     return resolved, session
 
 
-def _warn_of_equal_rates(resolved: Sequence[ResolvedConfig]) -> None:
-    """Say which rate points of a method have the same values, since --set or --config overrides what differs."""
+def _refuse_unavailable(resolved: Sequence[ResolvedConfig], plugins: PluginManager) -> None:
+    """Ask the probe that a method declares as `available`, "module:function", () -> the reason why not, or None.
+
+    Raises CapabilityError.
+    """
+    for entry in {each.method: plugins.methods.entry(each.method) for each in resolved}.values():
+        probe = entry.declared.get("available")
+        reason = pkgutil.resolve_name(probe)() if isinstance(probe, str) else None
+        if reason is not None:
+            raise CapabilityError(f"method '{entry.name}': {reason}")
+
+
+def _tell_equal_rates(resolved: Sequence[ResolvedConfig]) -> None:
+    """Say which rate points of a method have the same values, since --set or --config overrides what differs.
+
+    Raises click.UsageError where a size does: each of the files would be trained for and measured anew.
+    """
     from splatwizard_core.runs.config import content_hash
 
     equal: dict[str, list[ResolvedConfig]] = {}
@@ -298,6 +315,8 @@ def _warn_of_equal_rates(resolved: Sequence[ResolvedConfig]) -> None:
         equal.setdefault(content_hash(told), []).append(each)
     for same in (found for found in equal.values() if len(found) > 1):
         rates = ", ".join(each.rate for each in same)
+        if size := getattr(same[0].config, "size", ""):
+            raise click.UsageError(f"{same[0].method} {rates}: the same file, as size={size} says it: give one --rate")
         say(f"warning: {same[0].method} {rates}: these rate points give the same file, as what differs is overridden")
 
 

@@ -267,6 +267,8 @@ class ContainerReader:
                 raise self._damage(str(error), "header") from error
         elif prefix.packets is not None or prefix.bytes is not None:
             raise UserInputError(f"{self.name}: it declares no cuts, it is decoded whole or not at all")
+        elif prefix.partial:
+            warn_once(f"{self.name}: it declares no cuts, so that --partial is of no use to it")
         if self.cuts and available <= self.cuts[-1].bytes:
             try:
                 self.packets = chosen_cut(self.cuts, available, start, prefix, self.name)

@@ -61,8 +61,8 @@ def in_world(model: SplatModel, name: str) -> SplatModel:
     """
     if not isinstance(model, GaussianModel):
         raise UserInputError(
-            f"--world: {name} holds no explicit Gaussians (but {type(model).__name__}), whose Gaussians depend on the "
-            "camera; `sw bake FILE OUT --scene SCENE` fits explicit ones, which keep the origin of the scene"
+            f"--world: {name} holds no explicit Gaussians, its own depend on the camera; "
+            "`sw bake FILE OUT --scene SCENE` fits explicit ones, which keep the origin of the scene"
         )
     if model.world_origin is None:
         raise UserInputError(
