@@ -2,10 +2,11 @@
 
 from decimal import Decimal, getcontext
 from math import comb
+from types import SimpleNamespace
 
 import pytest
 import torch
-from sw_gaussians.density.mcmc import add_noise, draw, grow, relocate, shared_among
+from sw_gaussians.density.mcmc import MCMC, add_noise, draw, grow, relocate, shared_among
 from sw_gaussians.start import gaussians_from_points
 
 from splatwizard_core.errors import ShapeError
@@ -168,6 +169,14 @@ def test_the_noise_has_the_covariance_of_the_gaussian_and_spares_the_opaque():
     found = moved.T @ moved / len(moved)
     assert float((found - expected).norm() / expected.norm()) < 0.04  # 20,000 draws: 1 % each
     assert model.means[0].norm().item() == 0.0  # sigmoid(-99.5) x 50 Sigma z
+
+
+@pytest.mark.parametrize(("cap", "added"), [(None, 42), (70, 50), (1_000, 80)])
+def test_without_a_cap_growth_ends_at_what_the_pixels_ask_for(cap, added):
+    model, optimizer = model_of([0.5] * 20)
+    view = SimpleNamespace(camera=SimpleNamespace(width=2, height=1))
+    state = SimpleNamespace(model=model, optimizer=optimizer, step=600, scene=SimpleNamespace(train=[view, view]))
+    assert MCMC(cap=cap, growth=4.0).add(state) == {"added": added}  # 62.5 for four pixels, which rounds to even
 
 
 def test_a_run_of_the_same_stream_draws_the_same():

@@ -4,10 +4,12 @@ import copy
 
 import pytest
 import torch
+from sw_gaussians.density.mcmc import cap_for
 from sw_gaussians.ply import export_ply
 from sw_kit import short_training
 from sw_kit.short_training import file_of, psnr
 
+from splatwizard_core.api import Camera, View
 from splatwizard_core.coding.container import ContainerReader
 from splatwizard_core.errors import ConfigError, SceneError
 from splatwizard_core.gaussians.model import GaussianModel
@@ -107,7 +109,8 @@ def test_rate_points_and_presets_resolve():
         (r["rate_term.lambda_"] for r in Wisp.RATES.values()), reverse=True
     )
     assert resolve(Wisp, "paper").pretrained["preset"] == "mcmc"
-    assert resolve(Wisp, "synthetic").config.budget.cap == 250_000
+    assert resolve(Wisp, "paper").pretrained["density.settings.cap"] is None
+    assert resolve(Wisp, "paper").config.budget.cap is None
 
 
 def test_there_is_no_start_from_points(plugins, toy):
@@ -118,13 +121,23 @@ def test_there_is_no_start_from_points(plugins, toy):
 def test_conversion_keeps_the_worthiest_up_to_the_cap():
     costs = torch.tensor([5.0, -1.0, 3.0, 0.0, 2.0, -7.0, 4.0, 1.0, 6.0, 9.0], dtype=torch.float64)
     config = apply_overrides(WispConfig(), {"budget.cap": 4, "budget.cap_factor": 0.5}, source="test")
-    assert kept_rows(costs, config).tolist() == [0, 8, 9]  # 1.5 x 0.5 x 4
-    # Three do harm, two of ten may go.
-    assert (
-        kept_rows(costs, WispConfig()).tolist() == [0, 1, 2, 3, 4, 6, 7, 8]
-        or 5 not in kept_rows(costs, WispConfig()).tolist()
-    )
-    assert len(kept_rows(costs, WispConfig())) == 8
+    views = views_of(8, 8)
+    assert kept_rows(costs, views, config).tolist() == [0, 8, 9]  # 1.5 x 0.5 x 4
+    rest = kept_rows(costs, views, WispConfig()).tolist()
+    assert len(rest) == 8  # three do harm, two of ten may go
+    assert 5 not in rest
+
+
+def views_of(width, height, count=1):
+    camera = Camera(width=width, height=height, fx=30.0, fy=30.0, cx=16.0, cy=12.0, R=torch.eye(3), tau=torch.zeros(3))
+    return [View(camera, "a", lambda: None)] * count
+
+
+def test_without_a_cap_as_many_begin_as_the_pixels_ask_for():
+    assert cap_for(views_of(800, 800, 100)) == 250_000
+    assert cap_for(views_of(1, 1)) == 31
+    costs = torch.linspace(1, 2, 100, dtype=torch.float64)
+    assert len(kept_rows(costs, views_of(2, 2), WispConfig())) == round(1.5 * 0.8 * 62)
 
 
 def test_conversion_keeps_the_pictures(train, toy, rasterizer):

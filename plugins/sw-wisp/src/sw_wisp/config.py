@@ -12,9 +12,9 @@ from sw_wisp.numbers import LATENTS
 
 
 class Budget(Params):
-    """Number of splats that the training begins with; removal decides how many stay."""
+    """Number of splats that the training begins with, 1.5 caps at most; removal decides how many stay."""
 
-    cap: int = Field(600_000, ge=1, description="most splats, times `budget.cap_factor`; half as many more may begin")
+    cap: int | None = Field(None, ge=1, description="most splats, times `budget.cap_factor`; None: by training pixels")
     cap_factor: float = Field(0.8, gt=0, le=10, description="what the rate points set")
     worthless: float = Field(0.2, ge=0, lt=1, description="largest share that is dropped first, as the pictures gain")
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
+from sw_gaussians.density.mcmc import cap_for
 from torch import Tensor
 
 from splatwizard_core.api import GaussianModel
@@ -32,13 +33,13 @@ WIDEST_RATIO = 9.7
 looks the same."""
 
 
-def kept_rows(costs: Tensor, config: WispConfig) -> Tensor:
+def kept_rows(costs: Tensor, views: Sequence[View], config: WispConfig) -> Tensor:
     """Return the rows [M] int64, ascending, that begin: as many as the cap lets of the worthiest, few that do harm.
 
     costs   [N] of removal: at most 0 where the pictures are as good without
     """
     n = len(costs)
-    cap = round(HEAD_ROOM * config.budget.cap * config.budget.cap_factor)
+    cap = round(HEAD_ROOM * (config.budget.cap or cap_for(views)) * config.budget.cap_factor)
     harmful = min(int((costs <= 0).sum()), int(config.budget.worthless * n))
     keep = max(1, min(n - harmful, cap))
     return torch.sort(costs, descending=True, stable=True).indices[:keep].sort().values
@@ -71,7 +72,7 @@ def converted(
     """
     model.active_sh_degree = model.max_sh_degree
     found = worth(model, views, rasterizer, background, lambda_dssim=config.loss.lambda_dssim)
-    rows = kept_rows(found.squared_error, config)
+    rows = kept_rows(found.squared_error, views, config)
     rows = rows[within_reach(model.means.detach()[rows], found.squared_error[rows])]
     network = AppearanceNetwork(
         LATENTS.width, config.appearance.hidden, max(model.max_sh_degree, 1), generator=generator

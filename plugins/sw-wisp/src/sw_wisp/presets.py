@@ -7,17 +7,12 @@ GROWN: Mapping[str, Any] = {
     "pretrained.preset": "mcmc",
     "pretrained.iterations": 12_000,
     "pretrained.scale_schedule": True,
-    "pretrained.density.settings.cap": 600_000,
+    "pretrained.density.settings.cap": None,
 }
 """The scene that it starts from: grown by MCMC to more splats than stay, since removal beats growth."""
 
-SYNTHETIC: Mapping[str, Any] = {"budget.cap": 250_000, "pretrained.density.settings.cap": 250_000}
-
-BY_DATASET: Mapping[str, Mapping[str, Any]] = {"nerf_synthetic": SYNTHETIC}
-
 PRESETS: Mapping[str, Mapping[str, Any]] = {
     "paper": GROWN,
-    "synthetic": {**GROWN, **SYNTHETIC},
     # Half the steps after a scene of preset `fast` of 3dgs.
     "fast": {"pretrained.preset": "fast", "iterations": 9_000, "scale_schedule": True},
     # A CPU and the demo scene: a fifteenth of the steps, three removals; larger step sizes, since there are few steps,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -19,7 +19,7 @@ from splatwizard_core.api import ConfigError, DensityControl, GaussianModel, Los
 from sw_gaussians.density.splitting import rotate
 
 if TYPE_CHECKING:
-    from splatwizard_core.api import RenderResult, StageContext, TrainingState
+    from splatwizard_core.api import RenderResult, StageContext, TrainingState, View
     from splatwizard_core.training.density import DensityReport, DensityTask
 
 MAX_COPIES = 51
@@ -31,7 +31,7 @@ STEEPNESS = 100.0
 class MCMCSettings(Params):
     """Settings of density control by MCMC. Defaults are those of the paper's code."""
 
-    cap: int = Field(1_000_000, ge=1, description="most Gaussians that growth makes")
+    cap: int | None = Field(1_000_000, ge=1, description="most Gaussians that growth makes; None: by training pixels")
     start: int = Field(600, ge=0, description="first step that relocates and grows")
     stop: int = Field(25_000, ge=0, description="no relocation or growth from this step on")
     interval: int = Field(100, ge=1, description="steps between relocations")
@@ -98,7 +98,8 @@ class MCMC(DensityControl):
         """Add Gaussians, up to the cap."""
         model, settings = gaussians_of(state), self.settings
         draws, least = stream(model.split_seed, f"grow/{state.step}"), settings.min_opacity
-        added = grow(model, state.optimizer, draws, cap=settings.cap, growth=settings.growth, min_opacity=least)
+        cap = settings.cap or cap_for(state.scene.train)
+        added = grow(model, state.optimizer, draws, cap=cap, growth=settings.growth, min_opacity=least)
         return {"added": added}
 
     def regularised(self, loss: LossPack, result: RenderResult, step: int) -> LossPack:
@@ -114,6 +115,11 @@ class MCMC(DensityControl):
         parts = {"opacity": inputs.opacities.mean(), "scale": inputs.scales.mean()}
         total = loss.total + settings.opacity_weight * parts["opacity"] + settings.scale_weight * parts["scale"]
         return LossPack(total, loss.parts | {name: part.detach() for name, part in parts.items()})
+
+
+def cap_for(views: Sequence[View]) -> int:
+    """Return how many Gaussians are enough for training views: 250,000 for a hundred of 800x800."""
+    return round(31.25 * math.sqrt(sum(view.camera.width * view.camera.height for view in views)))
 
 
 def gaussians_of(state: TrainingState) -> GaussianModel:
