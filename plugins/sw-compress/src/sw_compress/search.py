@@ -38,7 +38,6 @@ class Search:
     pictures    of the source at cameras to choose with
     count       how many Gaussians stay; None: what is best
     tried       (gaussians, bytes estimated, dB against the source) of each that was drawn
-    coarsest    the smallest by the estimate of all that was looked at
     """
 
     coder: Quantized
@@ -48,8 +47,8 @@ class Search:
     errors: Errors
     count: int | None = None
     tried: list[tuple[int, float, float]] = field(default_factory=list)
-    coarsest: Choice | None = None
     _known: dict[int, tuple[GaussianModel, list[Curve]]] = field(default_factory=dict)
+    _coarsest: tuple[float, int, list[Curve]] | None = None
 
     def parts(self) -> list[int]:
         """Numbers of Gaussians to try, falling."""
@@ -68,11 +67,19 @@ class Search:
             self._known[count] = found
         return self._known[count]
 
-    def note_coarsest(self, part: GaussianModel, curves: list[Curve]) -> None:
-        """Remember a part at its coarsest, if nothing smaller is known."""
-        choice = Choice(part, curves, at_price(curves, COARSEST_PRICE))
-        if self.coarsest is None or choice.bytes < self.coarsest.bytes:
-            self.coarsest = choice
+    def note_coarsest(self, count: int, curves: list[Curve]) -> None:
+        """Remember what `part` gave for `count` at its coarsest, if nothing smaller is known."""
+        size = at_price(curves, COARSEST_PRICE).bytes
+        if self._coarsest is None or size < self._coarsest[0]:
+            self._coarsest = size, count, curves
+
+    @property
+    def coarsest(self) -> Choice | None:
+        """The smallest by the estimate of all that was looked at; its Gaussians are made anew, few searches need it."""
+        if self._coarsest is None:
+            return None
+        _, count, curves = self._coarsest
+        return Choice(self.reduction.part(count), curves, at_price(curves, COARSEST_PRICE))
 
 
 @dataclass(frozen=True)
@@ -122,7 +129,7 @@ def for_size(search: Search, budget: float) -> Choice | None:
     best, best_error, worse = None, math.inf, 0
     for count in search.parts():
         part, curves = search.part(count)
-        search.note_coarsest(part, curves)
+        search.note_coarsest(count, curves)
         found = within(curves, budget - FIXED_BYTES)
         last = part.num_rows > 1.02 * count  # the rest may not go
         if found is not None:
