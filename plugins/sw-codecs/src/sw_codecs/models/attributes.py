@@ -98,9 +98,7 @@ def _parts(rows: NDArray[Any]) -> list[NDArray[Any]]:
     return [rows[start : start + ROWS_AT_ONCE] for start in range(0, max(len(rows), 1), ROWS_AT_ONCE)]
 
 
-def quantize(
-    given: Ready, steps: Steps, order: NDArray[np.int64]
-) -> tuple[NDArray[np.int32], NDArray[np.int8] | None]:
+def quantize(given: Ready, steps: Steps, order: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int8] | None]:
     """Integers [N, 10 + 3R] (of surfels 9 + 3R) of the rows in this order, and the basis of SH where it pays.
 
     Each is the nearest one. Raises UserInputError if an integer is beyond 2^30.
