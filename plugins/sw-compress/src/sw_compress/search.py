@@ -14,6 +14,7 @@ from sw_compress.coders import FIXED_BYTES, POSITIONS, Quantized
 from sw_compress.measuring import Errors
 from sw_compress.quality import Pictures, decibels
 from sw_compress.rows import select
+from sw_compress.stages import give_back
 from sw_compress.targets import QUALITY_MARGIN
 
 if TYPE_CHECKING:
@@ -128,21 +129,31 @@ def for_size(search: Search, budget: float) -> Choice | None:
     """The best picture in a file of an estimated `budget` bytes; None where nothing is so small."""
     best, best_error, worse = None, math.inf, 0
     for count in search.parts():
-        part, curves = search.part(count)
-        search.note_coarsest(count, curves)
-        found = within(curves, budget - FIXED_BYTES)
-        last = part.num_rows > 1.02 * count  # the rest may not go
-        if found is not None:
-            choice = Choice(part, curves, found)
-            error = search.pictures.error(search.coder.rounded(part, found.levels))
-            search.tried.append((part.num_rows, choice.bytes, decibels(error)))
+        choice, error, last = _looked_at(search, count, budget)
+        if choice is not None:
             if error < best_error:
                 best, best_error, worse = choice, error, 0
             else:
                 worse += 1
+        choice = None  # its Gaussians go before the next ones are made
         if worse == PATIENCE or last:
             break
     return best
+
+
+def _looked_at(search: Search, count: int, budget: float) -> tuple[Choice | None, float, bool]:
+    """The best that so many Gaussians give, its error, and whether no fewer may stay."""
+    part, curves = search.part(count)
+    give_back()
+    search.note_coarsest(count, curves)
+    found = within(curves, budget - FIXED_BYTES)
+    last = part.num_rows > 1.02 * count  # the rest may not go
+    if found is None:
+        return None, math.inf, last
+    choice = Choice(part, curves, found)
+    error = search.pictures.error(search.coder.rounded(part, found.levels))
+    search.tried.append((part.num_rows, choice.bytes, decibels(error)))
+    return choice, error, last
 
 
 def least_bytes(search: Search) -> float:
