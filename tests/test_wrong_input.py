@@ -57,6 +57,7 @@ ROWS = [
     Row("run --rate r1,", "no rate point ''"),
     Row("run --rate midium", "no rate point 'midium'"),
     Row("train --rate all", "takes one method and one rate point"),
+    Row("run --method hac --rate all --size 5MB", "--rate all with --size 5MB would make one file again and again"),
     Row("run --preset quik", "no preset 'quik': one of paper"),
     Row("eval {grey.swz} --scene demo:tiny --metrics pnsr", "no metric is called 'pnsr'; did you mean 'psnr'?"),
     Row("eval {grey.swz} --scene demo:tiny --metrics ,", "--metrics is empty"),

@@ -109,6 +109,7 @@ class Quantized:
         """The rounding of a model; that of the last one is kept while it is as it was."""
         state = [self.power, *(getattr(model, name)._version for name in model.RAW)]
         if not _last or _last[0][0]() is not model or _last[0][1] != state:
+            _last.clear()  # it holds a model, and so does the next
             _last[:] = [(weakref.ref(model), state, Rounding(model, self.power, OWN_BASIS))]
         return _last[0][2]
 

@@ -90,8 +90,7 @@ def fill(
         budget = choice.bytes + AIM * size - written
         far_off = abs(choice.bytes / written - 1) > FAR_OFF
         choice = choose(budget) if far_off and chosen is None else choice.resized(budget)
-    coarsest = search.coarsest if chosen is None else chosen.coarsest()
-    if best is None and coarsest is not None:
+    if best is None and (coarsest := search.coarsest if chosen is None else chosen.coarsest()) is not None:
         best = coarsest
         most = file.write(best.model, best.allocation.levels)
         if most > size:

@@ -8,6 +8,7 @@ import numpy as np
 
 from splatwizard_core.api import GaussianModel, track
 from sw_compress.allocation import Curve
+from sw_compress.stages import give_back
 
 if TYPE_CHECKING:
     from sw_compress.coders import Quantized
@@ -35,6 +36,7 @@ class Errors:
         self._measured: dict[str, tuple[list[float], list[float]]] = {}
         with track("measure precision", total=1 + len(names) * len(MEASURED), unit="models") as bar:
             rounding = coder.rounding(model)
+            give_back()
             whole = rounding.model_at(coder.whole_steps(finest))
             self.floor = pictures.error(whole)
             bar.advance()
@@ -43,11 +45,12 @@ class Errors:
                 for level in (*MEASURED, *COARSER):
                     if level > coder.levels(name)[-1] or (level not in MEASURED and 2.0 ** logs[-1] > SMALL):
                         continue
-                    changed = rounding.changed(whole, name, coder.whole_steps({**finest, name: level}))
-                    error = pictures.error(changed) - self.floor
+                    steps = coder.whole_steps({**finest, name: level})
+                    error = pictures.error(rounding.changed(whole, name, steps)) - self.floor
                     levels, logs = [*levels, level], [*logs, float(np.log2(max(error, 1e-14)))]
                     bar.advance(level in MEASURED)
                 self._measured[name] = levels, logs
+                give_back()
 
     def at(self, name: str, levels: np.ndarray) -> np.ndarray:
         """Mean squared error [L]."""

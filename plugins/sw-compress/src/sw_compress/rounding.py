@@ -183,15 +183,23 @@ _SIGNS = torch.tensor([[1.0, 1, 1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1], [-1, 1, -
 
 
 def canonical(log_scales: Tensor, quats: Tensor) -> tuple[Tensor, Tensor]:
-    """Log scales [N,3] in descending order, and x, y, z [N,3] of unit quaternions with w >= 1/2, float64.
+    """Log scales [N,3] in descending order, and x, y, z [N,3] of unit quaternions with w >= 1/2, these float64.
 
     As `sw_codecs.models.gauge.canonical`.
     """
+    sorted_scales, xyz = torch.empty_like(log_scales), torch.empty_like(log_scales, dtype=torch.float64)
+    for start in range(0, len(quats), ROWS_AT_ONCE):
+        part = slice(start, start + ROWS_AT_ONCE)
+        sorted_scales[part], xyz[part] = _canonical(log_scales[part], quats[part])
+    return sorted_scales, xyz
+
+
+def _canonical(log_scales: Tensor, quats: Tensor) -> tuple[Tensor, Tensor]:
     q = quats.double()
     norm = q.square().sum(1, keepdim=True).sqrt()
     unit = q.new_tensor([1.0, 0.0, 0.0, 0.0])
     q = torch.where(norm > 1e-12, q / norm.clamp_min(1e-12), unit)
-    scales, order = torch.sort(log_scales.double(), dim=1, descending=True, stable=True)
+    scales, order = torch.sort(log_scales, dim=1, descending=True, stable=True)
     w, x, y, z = _TURNS.to(q.device)[9 * order[:, 0] + 3 * order[:, 1] + order[:, 2]].unbind(1)
     a, b, c, d = q.unbind(1)
     q = torch.stack([
@@ -200,7 +208,7 @@ def canonical(log_scales: Tensor, quats: Tensor) -> tuple[Tensor, Tensor]:
     ], dim=1)  # fmt: skip
     best = q.abs().argmax(1)
     q = q.gather(1, _PLACES.to(q.device)[best]) * _SIGNS.to(q.device)[best]
-    return scales, torch.where(q[:, :1] < 0, -q, q)[:, 1:].contiguous()
+    return scales, torch.where(q[:, :1] < 0, -q, q)[:, 1:]
 
 
 def _complete(xyz: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ from sw_compress.coders import FIXED_BYTES, POSITIONS, Quantized
 from sw_compress.measuring import Errors
 from sw_compress.quality import Pictures, decibels
 from sw_compress.rows import select
+from sw_compress.stages import give_back
 from sw_compress.targets import QUALITY_MARGIN
 
 if TYPE_CHECKING:
@@ -38,7 +39,6 @@ class Search:
     pictures    of the source at cameras to choose with
     count       how many Gaussians stay; None: what is best
     tried       (gaussians, bytes estimated, dB against the source) of each that was drawn
-    coarsest    the smallest by the estimate of all that was looked at
     """
 
     coder: Quantized
@@ -48,8 +48,8 @@ class Search:
     errors: Errors
     count: int | None = None
     tried: list[tuple[int, float, float]] = field(default_factory=list)
-    coarsest: Choice | None = None
     _known: dict[int, tuple[GaussianModel, list[Curve]]] = field(default_factory=dict)
+    _coarsest: tuple[float, int, list[Curve]] | None = None
 
     def parts(self) -> list[int]:
         """Numbers of Gaussians to try, falling."""
@@ -68,11 +68,19 @@ class Search:
             self._known[count] = found
         return self._known[count]
 
-    def note_coarsest(self, part: GaussianModel, curves: list[Curve]) -> None:
-        """Remember a part at its coarsest, if nothing smaller is known."""
-        choice = Choice(part, curves, at_price(curves, COARSEST_PRICE))
-        if self.coarsest is None or choice.bytes < self.coarsest.bytes:
-            self.coarsest = choice
+    def note_coarsest(self, count: int, curves: list[Curve]) -> None:
+        """Remember what `part` gave for `count` at its coarsest, if nothing smaller is known."""
+        size = at_price(curves, COARSEST_PRICE).bytes
+        if self._coarsest is None or size < self._coarsest[0]:
+            self._coarsest = size, count, curves
+
+    @property
+    def coarsest(self) -> Choice | None:
+        """The smallest by the estimate of all that was looked at; its Gaussians are made anew, few searches need it."""
+        if self._coarsest is None:
+            return None
+        _, count, curves = self._coarsest
+        return Choice(self.reduction.part(count), curves, at_price(curves, COARSEST_PRICE))
 
 
 @dataclass(frozen=True)
@@ -121,21 +129,31 @@ def for_size(search: Search, budget: float) -> Choice | None:
     """The best picture in a file of an estimated `budget` bytes; None where nothing is so small."""
     best, best_error, worse = None, math.inf, 0
     for count in search.parts():
-        part, curves = search.part(count)
-        search.note_coarsest(part, curves)
-        found = within(curves, budget - FIXED_BYTES)
-        last = part.num_rows > 1.02 * count  # the rest may not go
-        if found is not None:
-            choice = Choice(part, curves, found)
-            error = search.pictures.error(search.coder.rounded(part, found.levels))
-            search.tried.append((part.num_rows, choice.bytes, decibels(error)))
+        choice, error, last = _looked_at(search, count, budget)
+        if choice is not None:
             if error < best_error:
                 best, best_error, worse = choice, error, 0
             else:
                 worse += 1
+        choice = None  # its Gaussians go before the next ones are made
         if worse == PATIENCE or last:
             break
     return best
+
+
+def _looked_at(search: Search, count: int, budget: float) -> tuple[Choice | None, float, bool]:
+    """The best that so many Gaussians give, its error, and whether no fewer may stay."""
+    part, curves = search.part(count)
+    give_back()
+    search.note_coarsest(count, curves)
+    found = within(curves, budget - FIXED_BYTES)
+    last = part.num_rows > 1.02 * count  # the rest may not go
+    if found is None:
+        return None, math.inf, last
+    choice = Choice(part, curves, found)
+    error = search.pictures.error(search.coder.rounded(part, found.levels))
+    search.tried.append((part.num_rows, choice.bytes, decibels(error)))
+    return choice, error, last
 
 
 def least_bytes(search: Search) -> float:

@@ -78,10 +78,13 @@ class Choices:
         from splatwizard_core.runs.config import rate_points, resolve
         from splatwizard_core.runs.pretrained import checked_start
 
-        values = self.values()
+        values, methods = self.values(), [plugins.methods.load(name) for name in self.method_names(plugins)]
+        if values.get("size") and any(len(rate_points(each, self.rate)) > 1 for each in methods if self.rate):
+            told = f"--rate {self.rate} with --size {values['size']} would make one file again and again"
+            raise click.UsageError(f"{told}: leave out one of the two")
         found = [
             resolve(method, self.preset, rate, self.config_file, values, scene=self.scene, plugins=plugins)
-            for method in map(plugins.methods.load, self.method_names(plugins))
+            for method in methods
             for rate in ([None] if self.rate is None else rate_points(method, self.rate))
         ]
         found = self._with_starts_alike(plugins, _without_unused_starts(plugins, found))

@@ -67,24 +67,15 @@ def base_columns(scales: int) -> int:
 
 @dataclass(frozen=True)
 class Ready:
-    """Values as they are rounded: what does not depend on steps, done once for many.
+    """Values, and what their rounding depends on beside the steps.
 
-    dc          in luma and chroma [N,3]
-    logits      [N,1], clipped
-    log_scales  in descending order
-    xyz         of unit quaternions [N,3]
-    rest        higher SH coefficients as they were [N,R,3]
     factors     of the steps of each row [N]
-    basis       for the higher SH coefficients, and these in it [N,3R]; None: there is none
+    basis       for the higher SH coefficients; None: there is none
     """
 
-    dc: Array
-    logits: Array
-    log_scales: Array
-    xyz: Array
-    rest: NDArray[Any]
+    values: Values
     factors: Array
-    basis: tuple[sh_basis.Basis, NDArray[np.float32]] | None = None
+    basis: sh_basis.Basis | None = None
 
 
 def ready(values: Values, factors: Array | None = None, own_basis: bool = False) -> Ready:
@@ -93,52 +84,51 @@ def ready(values: Values, factors: Array | None = None, own_basis: bool = False)
     factors     [N] of the steps of each Gaussian; None: 1 each
     own_basis   whether higher SH coefficients may get a basis of their own
     """
-    log_scales, quats = gauge.canonical(values.log_scales, values.quats)
-    logits = np.clip(np.asarray(values.opacity_logits, np.float64), -MAX_LOGIT, MAX_LOGIT)[:, None]
-    factors = np.ones(len(logits)) if factors is None else factors
+    count = len(values.opacity_logits)
+    factors = np.ones(count) if factors is None else factors
     basis = None
     if own_basis and values.rest.size:
-        rest = values.rest.reshape(len(logits), -1)
-        some = slice(None, None, sh_basis.stride(len(rest)))
-        found = sh_basis.fit(_parts(rest[some]), factors[some])
-        basis = found, np.concatenate([found.to(part).astype(np.float32) for part in _parts(rest)])
-    return Ready(to_luma(values.dc), logits, log_scales, quats[:, 1:], values.rest, factors, basis)
+        some = slice(None, None, sh_basis.stride(count))
+        basis = sh_basis.fit(_parts(values.rest.reshape(count, -1)[some]), factors[some])
+    return Ready(values, factors, basis)
 
 
 def _parts(rows: NDArray[Any]) -> list[NDArray[Any]]:
-    """Some rows at a time: doubles of all of them would be the largest thing in memory."""
+    """Some rows at a time."""
     return [rows[start : start + ROWS_AT_ONCE] for start in range(0, max(len(rows), 1), ROWS_AT_ONCE)]
 
 
-def quantize(values: Ready, steps: Steps) -> tuple[NDArray[np.int32], NDArray[np.int8] | None]:
-    """Integers [N, 10 + 3R] (of surfels 9 + 3R), each the nearest one, and the basis of SH where it pays.
+def quantize(given: Ready, steps: Steps, order: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int8] | None]:
+    """Integers [N, 10 + 3R] (of surfels 9 + 3R) of the rows in this order, and the basis of SH where it pays.
 
-    Raises UserInputError if an integer is beyond 2^30.
+    Each is the nearest one. Raises UserInputError if an integer is beyond 2^30.
 
     A dead zone around zero, as in video codecs, does not pay: it shrinks the coefficients of all the Gaussians behind a
     pixel in one direction, so their errors add up (a tenth of a step cost 0.05 dB on the demo scene, and saved less
     than a coarser step that costs as much).
     """
-    count, factors = len(values.logits), values.factors
-    coded, basis = values.rest, None
-    if values.basis is not None and values.basis[0].pays(count, steps.rest):
-        coded, basis = values.basis[1], values.basis[0].matrix
-    quat_steps = _quat_steps(steps, factors)
-    symbols = np.empty((count, base_columns(values.log_scales.shape[1]) + int(np.prod(coded.shape[1:]))), np.int32)
-    for start in range(0, count, ROWS_AT_ONCE):
-        part = slice(start, start + ROWS_AT_ONCE)
-        rest = coded[part] if basis is not None else to_luma(coded[part]).reshape(len(coded[part]), -1)
-        symbols[part] = np.concatenate(
+    values, count = given.values, len(order)
+    basis = given.basis if given.basis is not None and given.basis.pays(count, steps.rest) else None
+    columns = base_columns(values.log_scales.shape[1]) + int(np.prod(values.rest.shape[1:]))
+    symbols = np.empty((count, columns), np.int32)
+    for start in range(0, count, ROWS_AT_ONCE):  # doubles of all rows would outweigh the model several times
+        rows = order[start : start + ROWS_AT_ONCE]
+        factors = given.factors[rows]
+        log_scales, quats = gauge.canonical(values.log_scales[rows], values.quats[rows])
+        logits = np.clip(values.opacity_logits[rows].astype(np.float64), -MAX_LOGIT, MAX_LOGIT)[:, None]
+        rest = values.rest[rows]
+        coded = to_luma(rest) if basis is None else basis.to(rest.reshape(len(rows), -1)).astype(np.float32)
+        symbols[start : start + ROWS_AT_ONCE] = np.concatenate(
             [
-                _rounded("dc", steps.dc * factors[part], values.dc[part]),
-                _rounded("opacity", steps.opacity * factors[part], values.logits[part]),
-                _rounded("scale", steps.scale * factors[part], values.log_scales[part]),
-                _rounded("quat", quat_steps[part], values.xyz[part]),
-                _rounded("rest", steps.rest * factors[part], rest),
+                _rounded("dc", steps.dc * factors, to_luma(values.dc[rows])),
+                _rounded("opacity", steps.opacity * factors, logits),
+                _rounded("scale", steps.scale * factors, log_scales),
+                _rounded("quat", _quat_steps(steps, factors), quats[:, 1:]),
+                _rounded("rest", steps.rest * factors, coded.reshape(len(rows), -1)),
             ],
             axis=1,
         )
-    return symbols, basis
+    return symbols, None if basis is None else basis.matrix
 
 
 def _rounded(name: str, steps: Array, values: NDArray[Any]) -> Array:

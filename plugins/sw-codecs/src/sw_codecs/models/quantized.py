@@ -387,11 +387,11 @@ def rounded(
         precision=None if given.classes is None else True,
         primitive=given.primitive,
     )
-    symbols, basis = quantize(given.values, layout.steps)
+    symbols, basis = quantize(given.values, layout.steps, order)
     if basis is not None:
         layout = layout.model_copy(update={"sh_basis": True})
     classes = None if given.classes is None else given.classes[order]
-    return Lattice(layout, cells[order], symbols[order], basis, classes)
+    return Lattice(layout, cells[order], symbols, basis, classes)
 
 
 def lattice(
