@@ -133,8 +133,7 @@ def test_every_parameter_that_takes_a_word_offers_something_if_it_can():
             if not wordless and not by_type and parameter._custom_shell_complete is None:
                 silent.append(parameter.name)
     # Only the user knows their values.
-    known = {"images", "pins", "name", "only", "seed", "given", "size", "quality", "ratio", "split", "views", "frames",
-             "gaussians"}  # fmt: skip
+    known = {"images", "pins", "name", "only", "seed", "given", "size", "quality", "ratio", "split", "views", "frames"}
     assert set(silent) == known
 
 

@@ -90,7 +90,7 @@ ROWS = [
     Row("run --seed -1", "Invalid value for '--seed'"),
     Row("run --seed x", "'x' is not a valid integer"),
     Row("run --gaussians 0", "Invalid value for '--gaussians': 0 is not in the range x>=1"),
-    Row("run --method 3dgs --scene demo:tiny --rate r1,r2 --size 1MB", "the same file, as size=1MB says it: give one"),
+    Row("run --method 3dgs --scene demo:tiny --rate r1,r2 --size 1MB", "would make one file again and again"),
     Row("run --device tpu", "'tpu' is not one of 'auto', 'cpu', 'cuda'"),
     Row("run --repeats 0", "Invalid value for '--repeats'"),
     Row("decode {grey.swz} --repeats -1", "Invalid value for '--repeats'"),

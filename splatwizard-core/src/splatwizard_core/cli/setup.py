@@ -286,7 +286,7 @@ def open_training_session(chosen: Choices, plugins: PluginManager) -> tuple[list
     chosen = chosen.of_start()
     resolved = chosen.resolve(plugins)
     _refuse_unavailable(resolved, plugins)
-    _tell_equal_rates(resolved)
+    _warn_of_equal_rates(resolved)
     session = open_session(resolved[0], plugins)
     resolved = chosen.settled(resolved, plugins, session.scene)
     say(device_reason(resolved[0].ppl.device, session.device, plugins))
@@ -305,11 +305,8 @@ def _refuse_unavailable(resolved: Sequence[ResolvedConfig], plugins: PluginManag
             raise CapabilityError(f"method '{entry.name}': {reason}")
 
 
-def _tell_equal_rates(resolved: Sequence[ResolvedConfig]) -> None:
-    """Say which rate points of a method have the same values, since --set or --config overrides what differs.
-
-    Raises click.UsageError where a size does: each of the files would be trained for and measured anew.
-    """
+def _warn_of_equal_rates(resolved: Sequence[ResolvedConfig]) -> None:
+    """Say which rate points of a method have the same values, since --set or --config overrides what differs."""
     from splatwizard_core.runs.config import content_hash
 
     equal: dict[str, list[ResolvedConfig]] = {}
@@ -318,8 +315,6 @@ def _tell_equal_rates(resolved: Sequence[ResolvedConfig]) -> None:
         equal.setdefault(content_hash(told), []).append(each)
     for same in (found for found in equal.values() if len(found) > 1):
         rates = ", ".join(each.rate for each in same)
-        if size := getattr(same[0].config, "size", ""):
-            raise click.UsageError(f"{same[0].method} {rates}: the same file, as size={size} says it: give one --rate")
         say(f"warning: {same[0].method} {rates}: these rate points give the same file, as what differs is overridden")
 
 
