@@ -315,7 +315,7 @@ def operations(device: str) -> dict[str, Callable[[], list[Tensor]]]:
     from sw_anchors.fast.networks import network_outputs
     from sw_anchors.fast.rows import add_rows
     from sw_anchors.fast.seen_rows import ExpectedRows
-    from sw_anchors.fast.spawn import visible_gaussians
+    from sw_anchors.fast.spawn import fits, visible_gaussians
     from sw_compact3dgs.seen_rows import SeenRows
     from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_scene
 
@@ -385,6 +385,7 @@ def operations(device: str) -> dict[str, Callable[[], list[Tensor]]]:
         return [bits.detach(), *torch.autograd.grad(bits, learning)]
 
     def spawned() -> list[Tensor]:
+        assert fits(*anchors, masks)  # loads the kernels
         found = visible_gaussians(*anchors, masks)
         parts = (found.means, found.opacities, found.scales, found.quats, found.colors)
         return list(torch.autograd.grad(sum(part.pow(3).sum() for part in parts), [*anchors, masks]))
