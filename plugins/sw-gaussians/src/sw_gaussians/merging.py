@@ -114,7 +114,8 @@ def merge_groups(groups: Splats, *, rule: Rule = "ink", widen: bool = False) -> 
     members = covariances(scales, normalize(groups.quats, dim=-1))
     spread = offsets[..., :, None] * offsets[..., None, :]
     found = (shares[..., None, None] * (members + spread)).sum(dim=1)
-    values, axes = torch.linalg.eigh((found + found.mT) / 2)
+    # On the CPU: cusolver fails for some 100,000 matrices at once (CUSOLVER_STATUS_INTERNAL_ERROR, torch 2.11).
+    values, axes = (each.to(found.device) for each in torch.linalg.eigh(((found + found.mT) / 2).cpu()))
     values = values.clamp_min(0)
     if rule == "ink":
         wanted, size = _ink(alphas, members, offsets, axes[..., 1:]), 2 * math.pi * (values[:, 1] * values[:, 2]).sqrt()
