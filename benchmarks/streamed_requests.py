@@ -1,4 +1,4 @@
-"""What a viewer asks for of a streamed SOG: the PlayCanvas engine in headless Chromium, under three budgets of splats.
+"""Requests of a viewer of a streamed SOG: the PlayCanvas engine in headless Chromium, under three budgets of splats.
 
     npm install playcanvas
     python benchmarks/streamed_requests.py DIR/lod-meta.json --engine node_modules/playcanvas/build/playcanvas.mjs

@@ -97,7 +97,7 @@ def write_lod(
 
 
 def _shares(models: list[GaussianModel]) -> list[NDArray[np.float64]]:
-    """What `write_streamed` asks for: errors of levels in pictures from cameras that are made up."""
+    """Errors of levels in pictures from cameras that are made up, as `write_streamed` takes them."""
     worth = Worth(models[0], _raster(models[0]), load_plugins())
     return [worth.energies(models[0]), *(worth.errors(each) for each in models[1:])]
 
