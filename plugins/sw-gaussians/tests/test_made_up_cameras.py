@@ -68,6 +68,17 @@ def test_a_hollow_ball_is_a_room():
     assert made(model_of(torch.nn.functional.normalize(ball(), dim=1), 0.12)).kind == "room"
 
 
+def test_an_object_with_a_nook_is_no_room():
+    """Six boards: around its middle nearly all is opaque, above them all is free."""
+    a, b = (each.flatten() for each in torch.meshgrid(*[torch.linspace(-0.5, 0.5, 9)] * 2, indexing="ij"))
+    side = torch.full_like(a, 0.5)
+    box = torch.cat([torch.stack(each, 1) for each in (
+        (side, a, b), (-side, a, b), (a, side, b), (a, -side, b), (a, b, side), (a, b, -side))])  # fmt: skip
+    back = torch.stack([4 * a, 4 * b, -side], 1).repeat(2, 1)
+    found = made(model_of(torch.cat([box * torch.tensor([0.6, 0.6, 1.0]), back]), 0.06))
+    assert found.kind == "object"
+
+
 def test_no_camera_is_both_fitted_and_held_out():
     found = made(ROOM, fit=8, held_out=4)
     fitted = {camera.pose for camera in found.fit}

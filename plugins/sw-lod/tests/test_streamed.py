@@ -12,6 +12,7 @@ from sw_interchange import from_gaussians, read
 from sw_interchange.streamed_sog import parse_index
 from sw_lod import write_lod
 from sw_lod.command import lod
+from sw_lod.streamed import write_streamed
 from sw_lod.tree import build_tree, leaves_of
 
 from splatwizard_core.api import UserInputError
@@ -59,6 +60,37 @@ def test_the_box_of_a_parent_holds_those_of_its_children(written):
             assert np.all(np.array(child["bound"]["min"]) >= node["bound"]["min"])
             assert np.all(np.array(child["bound"]["max"]) <= node["bound"]["max"])
             pending.append(child)
+
+
+def leaves_told(node: dict) -> list[dict]:
+    return [leaf for child in node["children"] for leaf in leaves_told(child)] if "children" in node else [node]
+
+
+def test_each_place_tells_the_errors_of_its_levels(written):
+    found = json.loads(written[0].read_text())
+    assert found["lodErrors"] is True
+    errors = np.array([leaf["errors"] for leaf in leaves_told(found["tree"])])
+    assert errors.shape[1] == 3
+    assert not errors[:, 0].any()
+    assert (np.diff(errors, axis=1) >= 0).all()
+    assert 1e-4 < np.median(errors[:, 1]) < np.median(errors[:, 2]) < 1
+
+
+def test_errors_of_a_place_are_shares_of_its_own_picture(model, tmp_path):
+    scene = from_gaussians(model)
+    along = scene.means[:, np.ptp(scene.means, axis=0).argmax()]  # places are halved across their longest side
+    left = along < np.median(along)
+    levels = [scene, scene]
+    shares = [np.ones(1200), np.where(left, 0.5, 0.0)]
+    write_streamed(levels, tmp_path / "lod-meta.json", chunk=1200, shares=shares, iterations=1)
+    found = [leaf["errors"] for leaf in leaves_told(json.loads((tmp_path / "lod-meta.json").read_text())["tree"])]
+    assert np.array(found) == pytest.approx(np.array([[0, 0.5], [0, 0]]), abs=1e-3)
+
+
+def test_a_scene_that_no_picture_shows_has_no_errors(model, tmp_path):
+    scene = from_gaussians(model)
+    write_streamed([scene], tmp_path / "lod-meta.json", chunk=1200, shares=[np.zeros(1200)], iterations=1)
+    assert '"errors"' not in (tmp_path / "lod-meta.json").read_text()
 
 
 def test_a_unit_holds_one_level_and_is_closed_when_it_is_full(written):

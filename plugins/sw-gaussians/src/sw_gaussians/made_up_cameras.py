@@ -189,12 +189,18 @@ def _cameras(
 ) -> MadeUpCameras | None:
     """None where too few views are plausible, and with `takes_any` where none shows anything."""
     count = max(FEWEST_PLACES, 2 * math.ceil(ROOM_SHARE * fit / HEADINGS))
-    places, maps = _open_places(judged, extent, extent.r95, count)
+    places, maps = _spread_out(_open_places(judged, extent, extent.r95, count), extent, count)
     near = [_closed(seen) for place, seen in zip(places, maps, strict=True)
             if np.linalg.norm(place - extent.center) <= extent.r50]  # fmt: skip
-    kind = "room" if near and float(np.median(near)) > ROOM else "object"
-    if kind == "room":  # free cells also lie beyond its walls
-        places, maps = _open_places(judged, extent, extent.r50, count, closed=True)
+    kind = "object"
+    if _is_room(near):
+        middle = _open_places(judged, extent, extent.r50, count)
+        closed = [_closed(seen) for _, seen in middle]
+        if _is_room(closed):  # not just one nook of an object, as below the seat of a chair
+            kind = "room"
+            # Free cells also lie beyond its walls.
+            walled = [each for each, share in zip(middle, closed, strict=True) if share >= 0.9 * max(closed)]
+            places, maps = _spread_out(walled, extent, count)
     inside_share = (ROOM_SHARE if kind == "room" else OBJECT_SHARE) if len(places) > 1 else 0.0
     headings = [_headings(*each, up) for each in maps]
     parts, plausible = [], 0
@@ -308,21 +314,22 @@ def _inside(places: list[Array], headings: list[list[Array]]) -> Iterator[tuple[
                 yield place, place + directions[turn]
 
 
-def _open_places(
-    judged: _Judged, extent: Extent, radius: float, count: int, *, closed: bool = False
-) -> tuple[list[Array], list[tuple[Array, Array]]]:
-    """Up to `count` places where nothing is near, and their cube maps.
+def _is_room(closed: list[float]) -> bool:
+    """Whether around most of some places nearly all directions are opaque."""
+    return bool(closed) and float(np.median(closed)) > ROOM
 
-    radius          about the middle
-    closed          only those around which nearly as much is opaque as around any
-    """
-    found: list[tuple[Array, tuple[Array, Array]]] = []
-    for place in _free_places(judged, extent, radius, TRIED_PLACES * count):
-        if _cube_map(judged, place, extent, far=CLEARANCE * extent.r80, size=16)[0].mean() <= 0.1:
-            found.append((place, _cube_map(judged, place, extent)))
-    if closed and found:
-        least = 0.9 * max(_closed(seen) for _, seen in found)
-        found = [each for each in found if _closed(each[1]) >= least]
+
+def _open_places(judged: _Judged, extent: Extent, radius: float, count: int) -> list[tuple[Array, tuple[Array, Array]]]:
+    """Places within a radius about the middle where nothing is near, with their cube maps; of some twice as many."""
+    places = _free_places(judged, extent, radius, TRIED_PLACES * count)
+    return [(place, _cube_map(judged, place, extent)) for place in places
+            if _cube_map(judged, place, extent, far=CLEARANCE * extent.r80, size=16)[0].mean() <= 0.1]  # fmt: skip
+
+
+def _spread_out(
+    found: list[tuple[Array, tuple[Array, Array]]], extent: Extent, count: int
+) -> tuple[list[Array], list[tuple[Array, Array]]]:
+    """Up to `count` of these places, far from each other, and their cube maps."""
     order = _spread(np.array([place for place, _ in found]).reshape(-1, 3), extent.center)[:count]
     return [found[i][0] for i in order], [found[i][1] for i in order]
 

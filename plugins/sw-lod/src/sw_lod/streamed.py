@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from sw_interchange.known_formats import META
 from sw_interchange.scene import GaussianScene, WriteReport
 from sw_interchange.sog_writer import SogOptions, sog_files
@@ -15,18 +16,23 @@ from sw_interchange.sog_writer import SogOptions, sog_files
 from splatwizard_core.tooling import write_atomic
 from sw_lod.tree import Node, Rows, build_tree, leaves_of
 
+Shares = NDArray[np.float64]
+UNSEEN = 1e-3
+"""Of the mean squared picture of a leaf: added to that of each."""
 DIGITS = 7
-"""Of the numbers of a box; float32 has no more."""
+"""Of numbers in the index; float32 has no more."""
 
 
 def write_streamed(
-    levels: Sequence[GaussianScene], index: Path, *, chunk: int, iterations: int = 10,
+    levels: Sequence[GaussianScene], index: Path, *, chunk: int, shares: Sequence[Shares] = (), iterations: int = 10,
     say: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:  # fmt: skip
     """Write the index and its units beside it, the index last: it names files that are there.
 
     levels      the same scene ever coarser, in RDF; the finest first
     chunk       Gaussians of a leaf at most, all levels together; a unit is closed when it holds more
+    shares      of each level [N]: squared pictures of the finest by its Gaussians, then squared errors of the coarser
+                ones; none: a viewer that weighs errors counts Gaussians instead
     iterations  of the k-means that finds each unit's palette of SH
 
     Returns facts: `counts` by level, `units`, `leaves`, `bytes`, `warnings`. Raises UserInputError for a scene that
@@ -55,7 +61,8 @@ def write_streamed(
             warnings.update(report.notices())
             names.append(f"{folder}/{META}")
             say(f"{folder}: {len(rows):,} Gaussians")
-    text = json.dumps(_description(tree, levels, names, lods), separators=(",", ":"), allow_nan=False)
+    errors = _errors(leaves, shares)
+    text = json.dumps(_description(tree, levels, names, lods, errors), separators=(",", ":"), allow_nan=False)
     write_atomic(index, text.encode())
     return {
         "counts": [scene.num_gaussians for scene in levels], "units": len(names), "leaves": len(leaves),
@@ -87,21 +94,37 @@ def _write_unit(folder: Path, files: dict[str, bytes]) -> int:
     return sum(map(len, files.values()))
 
 
+def _errors(leaves: list[Node], shares: Sequence[Shares]) -> list[list[float]]:
+    """Squared error of each level by the squared picture of each leaf, never less than that of a finer level.
+
+    Of a leaf that hardly a picture shows it is nearly that of all. None of any leaf if no picture shows anything.
+    """
+    if not shares or not shares[0].any():
+        return []
+    sums = np.array([[share[leaf.rows[level]].sum() for leaf in leaves] for level, share in enumerate(shares)])
+    sums[0] += (least := UNSEEN * sums[0].mean())
+    of_all = sums[1:].mean(axis=1, keepdims=True) / sums[0].mean()
+    found = (sums[1:] + least * of_all) / sums[0]
+    return np.maximum.accumulate(np.concatenate([np.zeros((1, len(leaves))), found])).T.tolist()  # type: ignore[no-any-return]
+
+
 def _description(
-    tree: Node, levels: Sequence[GaussianScene], names: list[str], lods: list[dict[str, dict[str, int]]]
-) -> dict[str, Any]:
+    tree: Node, levels: Sequence[GaussianScene], names: list[str], lods: list[dict[str, dict[str, int]]],
+    errors: list[list[float]],
+) -> dict[str, Any]:  # fmt: skip
     counts = [scene.num_gaussians for scene in levels]
-    remaining = iter(lods)
+    remaining, wrong = iter(lods), iter(errors)
 
     def told(node: Node) -> dict[str, Any]:
         bound = {"min": _rounded(node.low), "max": _rounded(node.high)}
         if node.children is None:
-            return {"bound": bound, "lods": next(remaining)}
+            known = {"errors": _rounded(next(wrong))} if errors else {}
+            return {"bound": bound, "lods": next(remaining), **known}
         return {"bound": bound, "children": [told(child) for child in node.children]}
 
     return {
         "version": 1, "asset": {"generator": "Splatwizard"}, "count": sum(counts), "counts": counts,
-        "lodLevels": len(levels), "filenames": names, "tree": told(tree),
+        "lodLevels": len(levels), "lodErrors": bool(errors), "filenames": names, "tree": told(tree),
     }  # fmt: skip
 
 

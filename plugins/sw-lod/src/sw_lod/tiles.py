@@ -97,7 +97,7 @@ def encode(model: GaussianModel, writer: ContainerWriter, settings: TileSettings
     found = _lattice(_drawn(model), settings, positions)
     scene, n = reconstruct(found), found.layout.num_gaussians
     worth = Worth(scene, writer.raster, plugins)
-    weights = worth.weights
+    weights = worth.weights(scene)
     layer_of = _layers(weights, settings)
     stages = []
     for layer in range(settings.layers if n else 0):

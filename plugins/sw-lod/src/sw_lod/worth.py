@@ -34,17 +34,27 @@ class Worth:
         with suppress(SceneError):  # nothing of it can be seen from anywhere
             self._cameras = plausible_cameras(scene, self._rasterizer, fit=VIEWS, held_out=1, widest=WIDEST).fit
         self._pictures = [self._drawn(scene, camera) for camera in self._cameras]
+
+    def weights(self, scene: GaussianModel) -> NDArray[np.float64]:
+        """Of each Gaussian [N] of the scene, above 0: the squared change of all pictures by that of its colour."""
         found = sum((self._sums(scene, camera, ScoreSpec("weight", "blend_sq")) for camera in self._cameras),
                     np.zeros(scene.num_rows))  # fmt: skip
-        self.weights: NDArray[np.float64] = found + (LEAST * found.mean() if found.any() else 1.0)
-        """Of each Gaussian [N], above 0: the squared change of all pictures by that of its colour."""
+        return found + (LEAST * found.mean() if found.any() else 1.0)
 
     def errors(self, model: GaussianModel) -> NDArray[np.float64]:
         """Squared error of all pictures by the Gaussians [M] that show where it is, by their share of each pixel."""
+        pairs = zip(self._cameras, self._pictures, strict=True)
+        return self._shares(model, [self._drawn(model, camera) - picture for camera, picture in pairs])
+
+    def energies(self, scene: GaussianModel) -> NDArray[np.float64]:
+        """The pictures of the scene itself, squared, by its Gaussians [N] as errors are."""
+        return self._shares(scene, self._pictures)
+
+    def _shares(self, model: GaussianModel, pictures: list[torch.Tensor]) -> NDArray[np.float64]:
         found = np.zeros(model.num_rows)
-        for camera, picture in zip(self._cameras, self._pictures, strict=True):
-            wrong = (self._drawn(model, camera) - picture).square().sum(dim=0)
-            found += self._sums(model, camera, ScoreSpec("error", "blend", pixel_weight=wrong))
+        for camera, picture in zip(self._cameras, pictures, strict=True):
+            spec = ScoreSpec("share", "blend", pixel_weight=picture.square().sum(dim=0))
+            found += self._sums(model, camera, spec)
         return found
 
     @torch.no_grad()
@@ -55,4 +65,4 @@ class Worth:
     def _sums(self, model: GaussianModel, camera: Camera, spec: ScoreSpec) -> NDArray[np.float64]:
         inputs = model.gaussians(camera, self._rasterizer)
         scores = self._rasterizer.accumulate(inputs, [camera], RasterOptions(scores=(spec,))).scores
-        return scores[spec.name].double().numpy()
+        return scores[spec.name].double().cpu().numpy()

@@ -9,7 +9,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from sw_gaussians.render_options import antialias_of, eps2d_of
 from sw_gaussians.simplifying import level_counts, merged_to
 from sw_gaussians.surfels import refuse_surfels
@@ -34,6 +36,7 @@ from splatwizard_core.tooling import (
     read_gaussians,
 )
 from sw_lod.streamed import write_streamed
+from sw_lod.worth import Worth
 
 SWZ = ".swz"
 CHUNK = 65_536
@@ -70,24 +73,41 @@ def write_lod(
         return _write_tiles(given, target, chunk, device, started)
     model, name = _opened(given, device)
     counts = level_counts(model.num_rows, levels)
-    scenes = [from_gaussians(model)]
+    models = [model]
     for level, count in enumerate(counts[1:], 1):
-        model = merged_to(model, count, widen=True)
-        scenes.append(from_gaussians(model))
+        models.append(merged_to(models[-1], count, widen=True))
         say(f"level {level}: {count:,} Gaussians")
     merged = time.perf_counter()
+    shares = _shares(models) if len(models) > 1 else []
+    measured = time.perf_counter()
+    scenes = [from_gaussians(each) for each in models]
     is_new = not target.parent.exists()
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
-        facts = write_streamed(scenes, target, chunk=chunk or CHUNK, say=say)
+        facts = write_streamed(scenes, target, chunk=chunk or CHUNK, shares=shares, say=say)
     except BaseException:  # an interrupt too: half of a scene is no use to anybody
         if is_new:
             shutil.rmtree(target.parent, ignore_errors=True)
         raise
     ended = time.perf_counter()
-    seconds = {"merge": round(merged - started, 3), "write": round(ended - merged, 3)}
+    seconds = {"merge": round(merged - started, 3), "measure": round(measured - merged, 3),
+               "write": round(ended - measured, 3)}  # fmt: skip
     return {"source": {"file": name, "gaussians": scenes[0].num_gaussians}, "out": str(target), **facts,
             "seconds": seconds}  # fmt: skip
+
+
+def _shares(models: list[GaussianModel]) -> list[NDArray[np.float64]]:
+    """Errors of levels in pictures from cameras that are made up, as `write_streamed` takes them."""
+    worth = Worth(models[0], _raster(models[0]), load_plugins())
+    return [worth.energies(models[0]), *(worth.errors(each) for each in models[1:])]
+
+
+def _raster(model: GaussianModel) -> dict[str, Any]:
+    """Header values that say how a model is drawn."""
+    raster: dict[str, Any] = {"antialias": True} if antialias_of(model) else {}
+    if (eps2d := eps2d_of(model)) != RasterOptions().eps2d:
+        raster["eps2d"] = eps2d
+    return raster
 
 
 def _write_tiles(
@@ -96,10 +116,7 @@ def _write_tiles(
     model, name = _opened(given, device)
     values = {"codec.name": "gaussians-tiles", **({} if chunk is None else {"codec.settings.rows": chunk})}
     origin = model.world_origin or (0.0, 0.0, 0.0)
-    raster: dict[str, Any] = {"antialias": True} if antialias_of(model) else {}
-    if (eps2d := eps2d_of(model)) != RasterOptions().eps2d:
-        raster["eps2d"] = eps2d
-    facts = encode(create_method(load_plugins(), "3dgs", values), model, raster, target, origin)
+    facts = encode(create_method(load_plugins(), "3dgs", values), model, _raster(model), target, origin)
     ends = [cut["bytes"] for cut in ContainerReader.open(target).summary()["cuts"]]
     return {"source": {"file": name, "gaussians": model.num_rows}, "out": str(target), "bytes": facts.bytes,
             "packets": ends, "warnings": [], "seconds": {"write": round(time.perf_counter() - started, 3)}}  # fmt: skip
