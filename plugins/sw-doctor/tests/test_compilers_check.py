@@ -96,10 +96,14 @@ def test_nvcc_is_judged_by_the_cuda_of_torch(bare, cuda_build):
 
 def test_an_nvcc_that_compiles_nothing_is_broken(bare, cuda_build):
     nvcc(bare, "13.0", status=1)
+    script(bare / "g++", "exit 0")
     found = compilers.check_nvcc()
     assert found.state == "broken"
     assert "unsupported GNU version" in found.detail
+    assert "CUDA toolkit again" in (found.mend or "")
     assert compilers.judge_nvcc(found, "13.0") == found
+    (bare / "g++").unlink()  # what nvcc asks for first
+    assert compilers.check_nvcc().mend == compilers.how_to_get_a_compiler()
 
 
 def test_an_nvcc_is_not_tried_beside_a_torch_for_cpus(bare, monkeypatch):

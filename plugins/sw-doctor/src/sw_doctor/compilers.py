@@ -67,6 +67,10 @@ def check_nvcc() -> Check:
     problem = None if _torch_is_cpu_build() else _compile([nvcc], ["-c"], CUDA_LINES, "doctor.cu")
     if problem is not None:
         mend = "install the CUDA toolkit again, with a host compiler that it knows"
+        try:
+            find_compiler()
+        except NativeBuildError:  # nvcc calls one, and says nothing of it
+            mend = how_to_get_a_compiler()
         return Check(GROUP, "nvcc", "broken", f"{nvcc} does not compile a kernel: {problem}", mend, facts=facts)
     return Check(GROUP, "nvcc", "ok", f"CUDA {release or '(no release told)'}, {nvcc}", facts=facts)
 
