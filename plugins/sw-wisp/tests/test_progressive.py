@@ -86,6 +86,21 @@ def test_what_is_drawn_of_a_prefix_is_what_decoders_draw(plain, plugins, toy, ra
         assert torch.allclose(*images, atol=2e-3), cut
 
 
+def test_packets_are_weighed_by_latents_that_decoders_predict(train, plugins, toy, rasterizer):
+    method, model = on_one_thread(train)
+    data, model = file_of(method, model), copy.deepcopy(model).eval()
+    camera, errors = toy.scene.test[0].camera, []
+    with torch.no_grad():
+        forecast, drawn = model.predicted()
+        theirs = prefix(plugins, data, 1).gaussians(camera, rasterizer)
+        first = model.layers.order[:1]
+        for each in (forecast, model.forecast_with(first, forecast)):
+            shown = (model.prefix_of(first, each, drawn), theirs)
+            ours, image = (rasterizer.render(found, camera, RasterOptions()).image for found in shown)
+            errors.append(float((ours - image).square().mean()))
+    assert errors[1] < errors[0] / 5  # the first knew latents that come later
+
+
 def test_a_step_that_draws_packets_draws_what_decoders_do(plain):
     model = copy.deepcopy(plain[1]).train()
     model.phase, order = HARD, model.layers.order

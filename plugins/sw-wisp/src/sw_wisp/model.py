@@ -19,7 +19,7 @@ from sw_wisp.fast.kernels import fit_kernels
 from sw_wisp.fast.splats import drawable as fast_drawable
 from sw_wisp.file import Scene
 from sw_wisp.layers import Known, Layers, as_known
-from sw_wisp.numbers import GROUPS, NUMBERS, SIZE
+from sw_wisp.numbers import GROUPS, LATENTS, NUMBERS, SIZE
 from sw_wisp.octree import Cells, position_bits
 from sw_wisp.plain import bounds_in, plain_gaussians
 from sw_wisp.pyramid import FEATURES
@@ -207,6 +207,18 @@ class WispModel(SplatModel):
         """Return what a rasterizer draws, and the bits of a splat, in tensors whose sizes no value decides."""
         visible = None if draws.known is None else draws.known.there[self.subsets]
         return self._shown(*self.drawn_and_bits(draws), draws.places)._replace(visible=visible)
+
+    @torch.no_grad()
+    def forecast_with(self, packets: Sequence[tuple[int, str]], forecast: Forecast) -> Forecast:
+        """The same, where latents are predicted from what these packets tell alone: a decoder has no others."""
+        if not isinstance(self.rate, PyramidRate):
+            return forecast
+        told = replace(self._placed(), order=tuple(packets))
+        walked = self.rate.measure(told, self._context, fixed=self.phase == FINAL)
+        context = (self._context[0], walked["view_features"])
+        mean = self.rate.predict(context, self.numbers(), self.rounding)[0].mean
+        start = LATENTS.columns.start
+        return forecast._replace(mean=torch.cat([forecast.mean[:, :start], mean[:, start:]], dim=1))
 
     def prefix_of(
         self, packets: Sequence[tuple[int, str]], forecast: Forecast, drawn: Tensor, swell: Tensor | None = None

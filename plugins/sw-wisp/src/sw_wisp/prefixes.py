@@ -61,7 +61,8 @@ def chosen_order(model: WispModel, views: Sequence[View], rasterizer: Rasterizer
     sums["fine"] /= max(model.layers.planes, 1)
 
     def error(packets: Sequence[tuple[int, str]]) -> float:
-        return squared_error(model.prefix_of(packets, forecast, drawn), views, rasterizer, background)
+        seen = model.prefix_of(packets, model.forecast_with(packets, forecast), drawn)
+        return squared_error(seen, views, rasterizer, background)
 
     return greedy_order(model.layers, error, lambda packet: float(sums[packet[1]][packet[0]]))
 
@@ -93,12 +94,13 @@ def fitted_swell(
     order, options, found = model.layers.order, RasterOptions(background=background), []
     for there in range(1, model.layers.subsets):
         ends = [n for n in range(1, len(order)) if sum(kind == "base" for _, kind in order[:n]) == there]
+        forecasts = [model.forecast_with(order[:end], forecast) for end in ends]
         swell = model.layers.swell_with(there, model.device).requires_grad_()
         optimizer = torch.optim.Adam([swell], lr=SWELL_LR)
         for update in range(updates):
             view = views[int(torch.randint(len(views), (), generator=draws))]
             optimizer.param_groups[0]["lr"] = SWELL_LR * (1 - update / updates)
-            gaussians = model.prefix_of(order[: ends[update % len(ends)]], forecast, drawn, swell)
+            gaussians = model.prefix_of(order[: ends[update % len(ends)]], forecasts[update % len(ends)], drawn, swell)
             image = rasterizer.render(gaussians, view.camera.to(model.device), options).image
             loss = photometric_loss(image, view.image(background, model.device)).total
             (swell.grad,) = torch.autograd.grad(loss, [swell])

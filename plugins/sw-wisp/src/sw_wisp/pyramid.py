@@ -209,7 +209,8 @@ def walked_features(
     levels      [N] int64, and cells [N,3] int64 at those levels; rows in any order
     values      [N,22] in base steps, as rounded; `indices` [N,22] their steps from the means
     labels      [N] subsets of splats; None: all in one
-    order       (subset, kind) of each packet; None: `default_order`
+    order       (subset, kind) of each packet; None: `default_order`. Where it lacks a `view`, as a prefix does, latents
+                are predicted at the end, as decoders do
     planes      refinements, and `multipliers` [N,22] steps in base steps; None: 1
 
     Those of latents come second. All tensors on one device. `make`: the class, or `running_means.pyramid_of`.
@@ -250,4 +251,8 @@ def walked_features(
             for part in parts:
                 found[1][part] = pyramid.features(number[part]).float() / UNIT
                 pyramid.add(number[part], VIEW, units[part, VIEW], indices[part, VIEW])
+    unseen = [subset for subset in left if (subset, "view") not in order]
+    if unseen:
+        rows = by_place[torch.isin(labels[by_place], torch.tensor(unseen, device=labels.device))]
+        found[1][rows] = pyramid.features(number[rows]).float() / UNIT
     return found[0], found[1]
