@@ -29,7 +29,7 @@ FRAMES = {"Y": "RUB", "Z": "RFU"}
 """Axes of a stage by its upAxis."""
 PROGRAM = Path(__file__).with_name("usd_process.py")
 MEGABYTES, SECONDS = (192, 24), (2, 0.2)
-"""What usd-core may take for a file: so much for the smallest, and so much for each of its megabytes."""
+"""Memory and processor time of usd-core for a file: of the smallest, and of each megabyte more."""
 MAX_LINE = 1 << 20
 
 
