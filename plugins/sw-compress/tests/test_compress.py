@@ -55,7 +55,7 @@ def test_the_record_holds_what_was_done(small):
     assert record["cameras"]["recipe"] == "plausible"
     assert set(record["seconds"]) >= {"read", "cameras", "sensitivities", "search", "encode", "check", "total"}
     assert record["quality"]["psnr"] > 25
-    assert record["told"].endswith("dB of the photographs if the source meets them at 27 / 32 / 36 dB")
+    assert record["told"].endswith("dB of photographs that the source meets at 27 / 32 / 36 dB")
     assert record["loss_of_photographs"]["27"] < record["loss_of_photographs"]["36"]
     held_out = {json.dumps(each) for each in record["cameras"]["held_out"]}
     assert not held_out & {json.dumps(each) for part in ("fit", "judge") for each in record["cameras"][part]}

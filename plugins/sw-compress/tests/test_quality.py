@@ -21,5 +21,5 @@ def test_errors_add_as_squares(psnr: float, photographs: float, loss: float):
 
 def test_the_loss_is_told_in_a_sentence():
     assert told_loss(40.1) == (
-        "40.1 dB to the source: 0.21 / 0.63 / 1.43 dB of the photographs if the source meets them at 27 / 32 / 36 dB"
+        "40.1 dB to the source: it costs 0.21 / 0.63 / 1.43 dB of photographs that the source meets at 27 / 32 / 36 dB"
     )

@@ -42,7 +42,7 @@ def told_loss(psnr: float) -> str:
     """Tell in a sentence what a PSNR against the source costs."""
     losses = " / ".join(f"{loss_against_photographs(psnr, each):.2f}" for each in PHOTOGRAPHS)
     known = " / ".join(f"{each:g}" for each in PHOTOGRAPHS)
-    return f"{psnr:.1f} dB to the source: {losses} dB of the photographs if the source meets them at {known} dB"
+    return f"{psnr:.1f} dB to the source: it costs {losses} dB of photographs that the source meets at {known} dB"
 
 
 @dataclass(frozen=True)

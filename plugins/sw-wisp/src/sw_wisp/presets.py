@@ -7,7 +7,7 @@ GROWN: Mapping[str, Any] = {
     "pretrained.preset": "mcmc",
     "pretrained.iterations": 12_000,
     "pretrained.scale_schedule": True,
-    "pretrained.density.settings.cap": None,
+    "pretrained.density.settings.cap": "none",
 }
 """The scene that it starts from: grown by MCMC to more splats than stay, since removal beats growth."""
 
