@@ -93,7 +93,7 @@ def decode(
     if out is not None:
         save_decoded(model, facts, out, plugins)
     printed = facts.model_dump(mode="json") | ({} if out is None else {"out": str(out)})
-    packets = "1 packet" if facts.packets == 1 else f"{facts.packets} packets"
-    part = f"{packets}, {facts.bytes:,} bytes, " if facts.packets else ""
+    many = "1 packet" if facts.packets == 1 else f"{facts.packets} packets"
+    part = f"{many}, {facts.bytes:,} bytes, " if facts.packets else ""
     told = f"{part}{shared.counted(facts.counts)}, decoded in {facts.decode_s:.3f} s on {facts.device}"
     shared.print_facts(printed, as_json, f"{facts.method}: {told}\nmodel digest {facts.digest}")
