@@ -109,7 +109,7 @@ def test_rate_points_and_presets_resolve():
         (r["rate_term.lambda_"] for r in Wisp.RATES.values()), reverse=True
     )
     assert resolve(Wisp, "paper").pretrained["preset"] == "mcmc"
-    assert resolve(Wisp, "paper").pretrained["density.settings.cap"] is None
+    assert resolve(Wisp, "paper").pretrained["density.settings.cap"] == "none"
     assert resolve(Wisp, "paper").config.budget.cap is None
 
 
