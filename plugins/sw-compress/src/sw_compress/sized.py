@@ -11,6 +11,7 @@ import torch
 from pydantic import Field
 from sw_gaussians.byte_sizes import ByteSize, parse_size
 from sw_gaussians.choices import CodecChoice
+from sw_gaussians.render_options import options_of
 from sw_gaussians.surfels import refuse_surfels
 
 from splatwizard_core.api import GaussianModel, Params, RasterOptions
@@ -64,8 +65,7 @@ class Sized:
         if self._size is None:
             return model, CodecChoice(name=self.WRITES)
         refuse_surfels(model, f"a size of {self.settings.size}")
-        options = {key: value for key, value in raster.items() if key in ("antialias", "eps2d") and value is not None}
-        rasterizer = NegotiatedRasterizer(self.plugins, device=model.device, options=options)
+        rasterizer = NegotiatedRasterizer(self.plugins, device=model.device, options=options_of(raster))
         origin, precise = None if scene is None else scene.origin, model.num_rows >= PRECISE_FROM
         coder = Quantized(self.plugins, raster, method, origin, precise)
         # A copy, since the search cuts it; gradients are what the significance of a Gaussian is made of.

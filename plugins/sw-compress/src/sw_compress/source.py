@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
-from sw_gaussians.render_options import antialias_of, eps2d_of
+from sw_gaussians.render_options import antialias_of, raster_of
 from sw_gaussians.surfels import refuse_surfels
 
-from splatwizard_core.api import GaussianModel, RasterOptions, SceneError, UserInputError
+from splatwizard_core.api import GaussianModel, SceneError, UserInputError
 from splatwizard_core.tooling import bytes_with_named, existing_file, open_model, read_gaussians
 from sw_compress.rows import select
 
@@ -43,9 +43,7 @@ class Source:
     @property
     def raster(self) -> dict[str, object]:
         """Options that its file asks of a renderer, as the compressed one will."""
-        eps2d = eps2d_of(self.model)
-        asked = {"antialias": True} if self.antialiased else {}
-        return {**asked, **({"eps2d": eps2d} if eps2d != RasterOptions().eps2d else {})}
+        return raster_of(self.model)
 
 
 def open_source(given: str | os.PathLike[str] | GaussianModel, plugins: PluginManager, device: torch.device) -> Source:

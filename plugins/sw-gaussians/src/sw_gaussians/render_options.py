@@ -20,6 +20,18 @@ def eps2d_of(model: SplatModel) -> float:
     return float(value) if type(value) in (int, float) and 0 <= value < math.inf else RasterOptions().eps2d
 
 
+def raster_of(model: SplatModel) -> dict[str, Any]:
+    """Return header values of a file by which the model is drawn as its own file asks for."""
+    eps2d = eps2d_of(model)
+    asked: dict[str, Any] = {"antialias": True} if antialias_of(model) else {}
+    return {**asked, **({"eps2d": eps2d} if eps2d != RasterOptions().eps2d else {})}
+
+
+def options_of(raster: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the header values of a file ask of a renderer."""
+    return {key: raster[key] for key in ("antialias", "eps2d") if raster.get(key) is not None}
+
+
 def lost_options(model: SplatModel) -> list[str]:
     """Describe the options that interchange formats cannot store; empty for most models."""
     eps2d = eps2d_of(model)

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from sw_gaussians.made_up_cameras import plausible_cameras
+from sw_gaussians.render_options import options_of
 
 from splatwizard_core.api import Camera, GaussianModel, PluginManager, RasterOptions, SceneError, ScoreSpec
 from splatwizard_core.tooling import NegotiatedRasterizer
@@ -28,8 +29,7 @@ class Worth:
     """
 
     def __init__(self, scene: GaussianModel, raster: Mapping[str, Any], plugins: PluginManager) -> None:
-        options = {key: raster[key] for key in ("antialias", "eps2d") if raster.get(key) is not None}
-        self._rasterizer = NegotiatedRasterizer(plugins, device=scene.device, options=options)
+        self._rasterizer = NegotiatedRasterizer(plugins, device=scene.device, options=options_of(raster))
         self._cameras: list[Camera] = []
         with suppress(SceneError):  # nothing of it can be seen from anywhere
             self._cameras = plausible_cameras(scene, self._rasterizer, fit=VIEWS, held_out=1, widest=WIDEST).fit

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from sw_gaussians.render_options import antialias_of, eps2d_of
+from sw_gaussians.render_options import raster_of
 from sw_gaussians.simplifying import level_counts, merged_to
 from sw_gaussians.surfels import refuse_surfels
 from sw_interchange.bridge import from_gaussians
@@ -21,7 +21,6 @@ from sw_interchange.known_formats import INDEX
 from splatwizard_core.api import (
     ContainerReader,
     GaussianModel,
-    RasterOptions,
     SceneError,
     UserInputError,
     create_method,
@@ -98,16 +97,8 @@ def write_lod(
 
 def _shares(models: list[GaussianModel]) -> list[NDArray[np.float64]]:
     """Errors of levels in pictures from cameras that are made up, as `write_streamed` takes them."""
-    worth = Worth(models[0], _raster(models[0]), load_plugins())
+    worth = Worth(models[0], raster_of(models[0]), load_plugins())
     return [worth.energies(models[0]), *(worth.errors(each) for each in models[1:])]
-
-
-def _raster(model: GaussianModel) -> dict[str, Any]:
-    """Header values that say how a model is drawn."""
-    raster: dict[str, Any] = {"antialias": True} if antialias_of(model) else {}
-    if (eps2d := eps2d_of(model)) != RasterOptions().eps2d:
-        raster["eps2d"] = eps2d
-    return raster
 
 
 def _write_tiles(
@@ -116,7 +107,7 @@ def _write_tiles(
     model, name = _opened(given, device)
     values = {"codec.name": "gaussians-tiles", **({} if chunk is None else {"codec.settings.rows": chunk})}
     origin = model.world_origin or (0.0, 0.0, 0.0)
-    facts = encode(create_method(load_plugins(), "3dgs", values), model, _raster(model), target, origin)
+    facts = encode(create_method(load_plugins(), "3dgs", values), model, raster_of(model), target, origin)
     ends = [cut["bytes"] for cut in ContainerReader.open(target).summary()["cuts"]]
     return {"source": {"file": name, "gaussians": model.num_rows}, "out": str(target), "bytes": facts.bytes,
             "packets": ends, "warnings": [], "seconds": {"write": round(time.perf_counter() - started, 3)}}  # fmt: skip
