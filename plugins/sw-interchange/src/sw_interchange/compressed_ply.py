@@ -14,7 +14,7 @@ from sw_interchange.bands import COEFFICIENTS, Array
 from sw_interchange.options import Options
 from sw_interchange.order import morton_order
 from sw_interchange.quats import ROOT_2, from_smallest_three, smallest_three
-from sw_interchange.scene import LARGEST_LOGIT, GaussianScene, Limits, ReadReport, WriteReport, decoded_bytes, sigmoid
+from sw_interchange.scene import GaussianScene, Limits, ReadReport, WriteReport, decoded_bytes, logits_of, sigmoid
 from sw_interchange.source import Source
 
 CHUNK = 256
@@ -108,9 +108,7 @@ def _four_bytes(words: Words) -> tuple[Array, Words]:
 
 
 def _logits(codes: Words) -> Array:
-    with np.errstate(divide="ignore"):
-        alphas = codes.astype(np.float32) / 255
-        return np.clip(np.log(alphas) - np.log1p(-alphas), -LARGEST_LOGIT, LARGEST_LOGIT).astype(np.float32)
+    return logits_of(codes.astype(np.float32) / 255)
 
 
 def _rotations(words: Words) -> Array:

@@ -16,7 +16,7 @@ from splatwizard_core.api import BitstreamError, UserInputError
 from sw_interchange.bands import COEFFICIENTS, Array
 from sw_interchange.frames import placed
 from sw_interchange.gltf_writer import EXTENSION, SPZ
-from sw_interchange.scene import FLAT, LARGEST_LOGIT, GaussianScene, Limits, ReadReport, decoded_bytes, joined
+from sw_interchange.scene import FLAT, GaussianScene, Limits, ReadReport, decoded_bytes, joined, logits_of
 from sw_interchange.source import Source, json_reason
 from sw_interchange.spz import read_spz
 
@@ -227,9 +227,8 @@ def _primitive(document: _Document, primitive: dict[str, Any], place: Matrix, re
         rest[:, k] = column(f"{EXTENSION}:SH_DEGREE_{d}_COEF_{i}", 3, n)
     with np.errstate(all="ignore"):
         log_scales = np.where(scales == 0, np.float32(FLAT), np.log(scales)).astype(np.float32)
-        logits = np.clip(np.log(alphas) - np.log1p(-alphas), -LARGEST_LOGIT, LARGEST_LOGIT).astype(np.float32)
     scene = GaussianScene(
-        means, log_scales, column(f"{EXTENSION}:ROTATION", 4, n)[:, [3, 0, 1, 2]], logits,
+        means, log_scales, column(f"{EXTENSION}:ROTATION", 4, n)[:, [3, 0, 1, 2]], logits_of(alphas),
         column(f"{EXTENSION}:SH_DEGREE_0_COEF_0", 3, n), rest, frame="LUF",
     )  # fmt: skip
     return _moved(document, scene, place)

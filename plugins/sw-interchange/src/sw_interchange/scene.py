@@ -219,6 +219,13 @@ def sigmoid(logits: Array) -> Array:
         return (1 / (1 + np.exp(-logits))).astype(np.float32, copy=False)
 
 
+def logits_of(alphas: Array) -> Array:
+    """Logit of opacities 0..1, both ends at 1e-6 and 1 - 1e-6."""
+    with np.errstate(all="ignore"):
+        found = np.log(alphas) - np.log1p(-alphas)
+    return np.clip(found, -LARGEST_LOGIT, LARGEST_LOGIT).astype(np.float32)
+
+
 def linear_scales(log_scales: Array, report: WriteReport) -> Array:
     """Standard deviations within the normal numbers of float32; what is clamped to them is counted."""
     found = np.clip(log_scales, SMALLEST_SCALE, LARGEST_SCALE)

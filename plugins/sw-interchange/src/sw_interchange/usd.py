@@ -17,12 +17,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from splatwizard_core.api import BitstreamError, CapabilityError, UserInputError
 from sw_interchange.bands import COEFFICIENTS, Array
 from sw_interchange.frames import placed
-from sw_interchange.scene import FLAT, LARGEST_LOGIT, GaussianScene, Limits, ReadReport, decoded_bytes, joined
+from sw_interchange.scene import FLAT, GaussianScene, Limits, ReadReport, decoded_bytes, joined, logits_of
 from sw_interchange.source import Source
 
 FRAMES = {"Y": "RUB", "Z": "RFU"}
@@ -102,10 +101,3 @@ def _scene(data: memoryview, at: int, n: int, k: int) -> GaussianScene:
         means, np.where(scales == 0, np.float32(FLAT), np.log(scales)).astype(np.float32), quats[:, [3, 0, 1, 2]],
         logits_of(alphas[:, 0]), rest[:, 0], np.ascontiguousarray(rest[:, 1:]), frame="RUB",
     )  # fmt: skip
-
-
-def logits_of(alphas: npt.NDArray[np.float32]) -> Array:
-    """Logits of opacities 0..1, both ends at 1e-6 and 1 - 1e-6."""
-    with np.errstate(all="ignore"):
-        found = np.log(alphas) - np.log1p(-alphas)
-    return np.clip(found, -LARGEST_LOGIT, LARGEST_LOGIT).astype(np.float32)
