@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from interchange_files import random_scene
+from interchange_files import covariances, random_scene
 from sw_interchange import GaussianScene
 from sw_interchange.bands import COEFFICIENTS
 from sw_interchange.frames import axes_of, band_rotation, flipped, sh_band, sh_signs, transformed
@@ -22,17 +22,6 @@ def colours(scene: GaussianScene, directions: np.ndarray) -> np.ndarray:
         band = scene.sh_rest[:, COEFFICIENTS[degree - 1] : COEFFICIENTS[degree]]
         found += np.einsum("mk,nkc->mnc", sh_band(directions, degree), band)
     return found
-
-
-def covariances(scene: GaussianScene) -> np.ndarray:
-    w, x, y, z = scene.quats.T.astype(np.float64)
-    rotation = np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]).transpose(2, 0, 1)  # fmt: skip
-    half = rotation * np.exp(scene.log_scales.astype(np.float64))[:, None]
-    return half @ half.transpose(0, 2, 1)
 
 
 def one_hot() -> GaussianScene:
