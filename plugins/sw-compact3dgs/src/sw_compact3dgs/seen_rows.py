@@ -6,11 +6,14 @@ deterministic, since rows could be named twice. Those of a mask are not.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+
+Copying = Callable[[Tensor], Tensor]
 
 
 class SeenRows:
@@ -23,12 +26,12 @@ class SeenRows:
 
     def take(self, values: Tensor) -> Tensor:
         """[N,C] -> [V,C]; differentiable."""
-        found: Tensor = _Take.apply(values, self)  # type: ignore[no-untyped-call]
+        found: Tensor = _Copy.apply(values, self.taken, self.placed)  # type: ignore[no-untyped-call]
         return found
 
     def put(self, values: Tensor) -> Tensor:
         """[V,C] -> [N,C], zeros where nothing is seen; differentiable."""
-        found: Tensor = _Put.apply(values, self)  # type: ignore[no-untyped-call]
+        found: Tensor = _Copy.apply(values, self.placed, self.taken)  # type: ignore[no-untyped-call]
         return found
 
     def taken(self, values: Tensor) -> Tensor:
@@ -42,25 +45,15 @@ class SeenRows:
         return values.index_select(0, self._places).masked_fill_(self._unseen[:, None], 0)
 
 
-class _Take(torch.autograd.Function):
+class _Copy(torch.autograd.Function):
+    """Copies rows by one function; the other one copies their gradient back."""
+
     @staticmethod
-    def forward(ctx: Any, values: Tensor, rows: SeenRows) -> Tensor:
-        ctx.rows = rows
-        return rows.taken(values)
+    def forward(ctx: Any, values: Tensor, there: Copying, back: Copying) -> Tensor:
+        ctx.back = back
+        return there(values)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        return ctx.rows.placed(gradient), None
-
-
-class _Put(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, values: Tensor, rows: SeenRows) -> Tensor:
-        ctx.rows = rows
-        return rows.placed(values)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        return ctx.rows.taken(gradient), None
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        return ctx.back(gradient), None, None
