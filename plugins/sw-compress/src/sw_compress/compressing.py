@@ -130,6 +130,7 @@ def compress(
             path, data = None, (folder / f"scene.{format}").read_bytes()
     with stages.timed("check"):
         found = held_out.quality(made)
+    pruned = reduction.pruned(made.num_rows)
     record = {
         "file": None if path is None else str(path),
         "format": format,
@@ -138,8 +139,8 @@ def compress(
         **facts,
         "gaussians": made.num_rows,
         "left_out": source.read - source.model.num_rows,
-        "pruned": reduction.pruned(made.num_rows),
-        "merged": source.model.num_rows - made.num_rows - reduction.pruned(made.num_rows),
+        "pruned": pruned,
+        "merged": source.model.num_rows - made.num_rows - pruned,
         "unseen": int(pruning.unseen.sum()),
         "sh_degree": made.active_sh_degree,
         "antialiased": source.antialiased,

@@ -65,13 +65,15 @@ class Rounding:
 
     def model_at(self, steps: Steps) -> GaussianModel:
         """The model as a file of these steps decodes to."""
-        raw = {parameter: self.parameter(name, steps) for parameter, name in NAMES.items()}
-        return like(self.model, type(self.model)(**raw, active_sh_degree=self.model.active_sh_degree))
+        return self._of({parameter: self.parameter(name, steps) for parameter, name in NAMES.items()})
 
     def changed(self, whole: GaussianModel, name: str, steps: Steps) -> GaussianModel:
         """A model that was rounded, with one attribute at other steps."""
         raw = {each: getattr(whole, each).detach() for each in whole.RAW}
         raw |= {parameter: self.parameter(name, steps) for parameter, each in NAMES.items() if each == name}
+        return self._of(raw)
+
+    def _of(self, raw: dict[str, Tensor]) -> GaussianModel:
         return like(self.model, type(self.model)(**raw, active_sh_degree=self.model.active_sh_degree))
 
     @torch.no_grad()
