@@ -16,6 +16,8 @@ import statistics
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
@@ -55,22 +57,29 @@ def coded(model: GaussianModel, prefixes: int, path: Path, plugins: PluginManage
     writer.write(path)
 
 
-def seconds(page: Path, size: tuple[int, int], folder: Path) -> tuple[float, float]:
-    """Return the seconds to the first picture and to the whole, in a browser of its own."""
+@contextmanager
+def opened(page: Path, size: tuple[int, int], folder: Path, timeout: float = TIMEOUT) -> Iterator[Chromium]:
+    """Give a browser of its own that has drawn the whole picture of a page. Exits where that fails."""
     with tempfile.TemporaryDirectory(dir=folder) as profile:
-        browser = Chromium(find_chromium() or "chromium", Path(profile), timeout=TIMEOUT, flags=WEBGL)
+        browser = Chromium(find_chromium() or "chromium", Path(profile), timeout=timeout, flags=WEBGL)
         try:
             browser.open(page, width=size[0], height=size[1])
-            until = time.monotonic() + TIMEOUT
+            until = time.monotonic() + timeout
             while browser.ask("document.documentElement.dataset.firstWhole") is None:
                 if time.monotonic() > until or browser.ask("document.documentElement.dataset.state") == "failed":
                     sys.exit(f"{page}: no picture: {browser.ask('document.getElementById(`told`).textContent')}")
                 time.sleep(0.1)
-            found = browser.ask(
-                "(({ firstFrame, firstWhole }) => [firstFrame, firstWhole])(document.documentElement.dataset)"
-            )
+            yield browser
         finally:
             browser.close()
+
+
+def seconds(page: Path, size: tuple[int, int], folder: Path) -> tuple[float, float]:
+    """Return the seconds to the first picture and to the whole, in a browser of its own."""
+    with opened(page, size, folder) as browser:
+        found = browser.ask(
+            "(({ firstFrame, firstWhole }) => [firstFrame, firstWhole])(document.documentElement.dataset)"
+        )
     return float(found[0]) / 1000, float(found[1]) / 1000
 
 

@@ -14,14 +14,12 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
-import time
 from pathlib import Path
 
+from first_picture import opened  # which makes the tests' browser known
+from headless_chromium import find_chromium
 from sw_view import page_file
 from view import made_up
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from headless_chromium import WEBGL, Chromium, find_chromium
 
 TIMEOUT = 240.0
 TURN = """new Promise(done => {
@@ -45,19 +43,9 @@ TURN = """new Promise(done => {
 
 def figures(page: Path, size: tuple[int, int], seconds: float, folder: Path) -> tuple[float, float, float]:
     """Return seconds to the first whole picture, frames a second while turning, and the share of the width."""
-    with tempfile.TemporaryDirectory(dir=folder) as profile:
-        browser = Chromium(find_chromium() or "chromium", Path(profile), timeout=TIMEOUT, flags=WEBGL)
-        try:
-            browser.open(page, width=size[0], height=size[1])
-            until = time.monotonic() + TIMEOUT
-            while browser.ask("document.documentElement.dataset.firstWhole") is None:
-                if time.monotonic() > until or browser.ask("document.documentElement.dataset.state") == "failed":
-                    sys.exit(f"{page}: no picture: {browser.ask('document.getElementById(`told`).textContent')}")
-                time.sleep(0.1)
-            first = float(browser.ask("document.documentElement.dataset.firstWhole")) / 1000
-            drawn, took, share = browser.ask(TURN % (1000 * seconds))
-        finally:
-            browser.close()
+    with opened(page, size, folder, TIMEOUT) as browser:
+        first = float(browser.ask("document.documentElement.dataset.firstWhole")) / 1000
+        drawn, took, share = browser.ask(TURN % (1000 * seconds))
     return first, drawn / took, share
 
 
