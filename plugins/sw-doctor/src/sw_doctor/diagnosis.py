@@ -61,13 +61,13 @@ def examine() -> Diagnosis:
             checks.append(_guarded(check.__name__, check))
         checks += probed(probe.result())
         torch_cuda = next((c.facts.get("cuda") for c in checks if c.name == "torch"), None)
-        checks += [cxx.result(), compilers.judge_nvcc(nvcc.result(), torch_cuda)]
+        judged = compilers.judge_nvcc(nvcc.result(), torch_cuda)
+        checks += [cxx.result(), judged]
         checks += packages.package_checks(needs, problems.result())
         works = {check.name for check in checks if check.state == "ok"}
         theirs = [check for entry, found in registered if needs_of(entry) <= works for check in found.result()]
     obstacle = next((c for c in checks if c.name in ("C++", "cache folder") and c.state != "ok"), None)
-    if obstacle is not None:
-        checks = [_without_builds(c, obstacle) for c in checks]
+    checks = [_without_builds(c, obstacle, judged) for c in checks]
     checks += theirs
     order = {group: place for place, group in enumerate(GROUPS)}
     checks.sort(key=lambda c: order.get(c.group, len(order)))
@@ -153,8 +153,15 @@ def _guarded(name: str, check: Callable[[], Check]) -> Check:
         return Check("system", name, "broken", one_line(f"the test failed: {type(error).__name__}: {error}"))
 
 
-def _without_builds(check: Check, obstacle: Check) -> Check:
-    """A check, knowing that nothing can be compiled here until the obstacle is gone: its line is what mends."""
+def _without_builds(check: Check, obstacle: Check | None, nvcc: Check) -> Check:
+    """A check, knowing that nothing can be compiled here until the obstacle is gone: its line is what mends.
+
+    For kernels of CUDA the finding about nvcc comes first: without one that fits torch a C++ compiler is of no use.
+    """
+    if check.facts.get("target") == "cuda" and nvcc.state != "ok" and nvcc.mend is not None:
+        obstacle = nvcc
+    if obstacle is None:
+        return check
     if check.facts.get("compiled_first"):
         return replace(check, detail=f"on {check.facts['device']}, but {SLOWLY}", mend=obstacle.mend)
     if check.mend is not None and check.mend.startswith("sw build-kernels"):
