@@ -13,6 +13,9 @@ sys.path.insert(0, str(ROOT / "tools"))
 
 import build_wheels  # noqa: E402
 
+from splatwizard_native import Toolchain  # noqa: E402
+from splatwizard_native.toolchain import Job  # noqa: E402
+
 WITH_KERNELS = [
     package
     for package in build_wheels.packages([])
@@ -38,3 +41,16 @@ def test_the_tag_names_the_newest_glibc_of_all_libraries(tmp_path):
         (tmp_path / name).write_bytes(symbols)
     libraries = sorted(tmp_path.iterdir())
     assert re.fullmatch(r"manylinux_2_34_aarch64", build_wheels.platform_of(libraries, "aarch64"))
+
+
+def test_zig_is_told_of_cpus_by_its_own_names_and_its_target_is_part_of_its_version(tmp_path, monkeypatch):
+    zig, job = tmp_path / "zig", Job(tmp_path / "a.cpp", tmp_path / "a.o", ("-O3", "-march=x86-64-v3"))
+    zig.write_text('#!/bin/sh\necho "zig $*"\n')
+    zig.chmod(0o755)
+    monkeypatch.setenv("CXX", f"{zig} c++ -target x86_64-linux-gnu.2.17")
+    tools = build_wheels.toolchain()
+    tools.compile([job], tmp_path / "log")
+    assert "-O3 -march=x86_64_v3" in (tmp_path / "log").read_text()
+    assert tools.version().endswith(" c++ -target x86_64-linux-gnu.2.17")
+    monkeypatch.setenv("CXX", sys.executable)
+    assert type(build_wheels.toolchain()) is Toolchain

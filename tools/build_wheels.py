@@ -26,7 +26,12 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from splatwizard_native import Toolchain
 
 ROOT = Path(__file__).resolve().parents[1]
 DECLARES = re.compile(r"^(\w+) = NativeModule\(", re.MULTILINE)
@@ -45,7 +50,7 @@ def packages(names: Sequence[str]) -> list[Path]:
 
 def compiled(package: Path, machine: str, into: Path) -> Iterator[Path]:
     """Compile the modules with a plain C face of a package; put each into its place below `into`, a folder like src."""
-    from splatwizard_native import NativeModule, Toolchain
+    from splatwizard_native import NativeModule
 
     for path in sorted((package / "src").rglob("*.py")):
         for name in DECLARES.findall(path.read_text(encoding="utf-8")):
@@ -53,7 +58,7 @@ def compiled(package: Path, machine: str, into: Path) -> Iterator[Path]:
             module = getattr(importlib.import_module(".".join(relative.with_suffix("").parts)), name)
             if not isinstance(module, NativeModule) or not module.face or module.cuda_sources:
                 continue
-            tools = Toolchain()
+            tools = toolchain()
             with tempfile.TemporaryDirectory() as scratch:
                 built = module.build(march=machine, folder=Path(scratch), tools=tools)
                 place = into / Path(*module.package.split(".")) / "prebuilt" / module.prebuilt_name("portable")
@@ -62,6 +67,23 @@ def compiled(package: Path, machine: str, into: Path) -> Iterator[Path]:
             facts = {"sha256": hashlib.sha256(place.read_bytes()).hexdigest(), "compiler": tools.version()}
             place.with_suffix(".json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
             yield place
+
+
+def toolchain() -> Toolchain:
+    """The compiler; zig takes the same flags but for names of CPUs, in which `-` switches a feature off."""
+    from splatwizard_native import Toolchain, find_compiler
+
+    class Zig(Toolchain):
+        def version(self) -> str:  # compiled objects are found again by it, and the target is no other flag
+            return f"{super().version()} {' '.join(self.compiler[1:])}"
+
+        def compile(self, jobs: Sequence[Any], log: Path) -> None:
+            named = re.compile("^-march=x86-64-v")
+            super().compile(
+                [replace(job, flags=tuple(named.sub("-march=x86_64_v", f) for f in job.flags)) for job in jobs], log
+            )
+
+    return Zig() if any("zig" in Path(part).name for part in find_compiler()) else Toolchain()
 
 
 def platform_of(libraries: Sequence[Path], machine: str) -> str:
