@@ -61,8 +61,8 @@ LIBRARIES = {
 EXTENDS = {"sw_hac_plus": "sw_hac"}
 """Method -> the method that it builds on, and so imports."""
 ABOUT_RUNS = {
-    "sw_bench", "sw_compress", "sw_datasets", "sw_doctor", "sw_geometry", "sw_kit", "sw_lod", "sw_metrics", "sw_report",
-    "sw_view",
+    "sw_bench", "sw_compress", "sw_datasets", "sw_doctor", "sw_geometry", "sw_interchange", "sw_kit", "sw_lod",
+    "sw_metrics", "sw_report", "sw_view",
 }  # fmt: skip
 """Packages that may use `tooling` besides `api`."""
 
@@ -87,7 +87,7 @@ def test_a_room_is_small_enough_to_follow(room):
 
 def test_core_and_native_together_stay_small():
     lines = lines_in(files_of(CORE)) + lines_in(files_of(NATIVE))
-    assert lines < 16_990, f"core and native have {lines:,} lines"
+    assert lines < 16_820, f"core and native have {lines:,} lines"
 
 
 @pytest.mark.parametrize("room", sorted(ROOMS))

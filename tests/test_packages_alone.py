@@ -103,7 +103,7 @@ def test_a_library_that_is_gone_is_named(everything):
 NAMED = {
     "report out": "sw-report", "doctor": "sw-doctor", "data list": "sw-datasets", "render x.swz": "sw-view",
     "bench": "sw-bench", "run --scene a,b": "sw-bench", "run --method hac": "sw-hac",
-    "info mipnerf360/garden": "sw-report",
+    "info mipnerf360/garden": "sw-report", "export x.swz x.ply": "sw-interchange", "truncate x.swz": "sw-lod",
 }  # fmt: skip
 
 

@@ -91,7 +91,7 @@ def test_a_missing_method_of_a_file_that_names_no_package(tmp_path, capsys):
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_missing_coder(tmp_path, capsys, only, command):
-    only("3dgs,render")
+    only("3dgs,render,interchange")
     path = write(tmp_path, requires=requires(sw_codecs="sw-coders-of-mars=2.0"))
     assert said(capsys, command, path) == (  # a name of ours is ours, whatever the file says
         f"error: garden.swz needs coder 'gaussians-quantized', which is not installed: sw-codecs {HERE} is there, "

@@ -40,7 +40,7 @@ class Row:
 ROWS = [
     # The command line itself.
     Row("rum", "no command 'rum': did you mean 'run'?"),
-    Row("xyzzy", "no command 'xyzzy': `sw --help` lists all"),
+    Row("xyzzy", "no command 'xyzzy': installed: run, bench, train, "),
     Row("data lsit", "No such command 'lsit'"),
     Row("run --sceen demo", "No such option '--sceen'"),
     Row("run extra", "unexpected extra argument"),

@@ -8,6 +8,7 @@ import pytest
 from interchange_files import ksplat_file, random_scene
 from sw_gaussians.ply import load_ply
 from sw_interchange import GaussianScene, decode, read, write
+from sw_interchange.export_command import in_world
 
 from splatwizard_core.api import ContainerReader, SceneError, SplatModel, UserInputError
 from splatwizard_core.cli.main import main
@@ -27,6 +28,23 @@ def ply(scene, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("ply") / "scene.ply"
     write(scene, path)
     return path
+
+
+def test_a_ply_is_exported_as_it_is(ply, tmp_path):
+    again = tmp_path / "again.ply"
+    assert main(["export", str(ply), str(again)]) == 0
+    assert again.read_bytes() == ply.read_bytes()
+
+
+def test_the_world_is_asked_for_only_where_it_is_known(ply):
+    model = load_ply(ply)
+    with pytest.raises(UserInputError, match=r"--world: m\.ply does not say where its origin lies"):
+        in_world(model, "m.ply")
+    with pytest.raises(UserInputError, match=r"--world: m\.swz holds no explicit Gaussians, its own.*sw bake"):
+        in_world(type("Anchors", (SplatModel,), {})(), "m.swz")
+    model.origin = {"world_origin": [448262.0, 5411933.0, 35.0]}
+    assert model.world_shift is None
+    assert in_world(model, "m.ply").world_shift == (448262.0, 5411933.0, 35.0)
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)

@@ -17,16 +17,13 @@ def register_metrics(registry: Registry) -> None:
 
 @hookimpl
 def register_commands(registry: Registry) -> None:
-    for position, (name, target, summary) in enumerate((
-        ("run", "run:run", "train, encode, decode, evaluate, report: one scene"),
-        ("train", "train:train", "train one method on one scene"),
-        ("encode", "codec:encode", "a trained model to one file"),
-        ("decode", "codec:decode", "a file back to a model, from nothing but itself"),
-        ("eval", "evaluate:evaluate", "quality, speed and memory of an encoded scene"),
-        ("export", "export:export", ".ply and other interchange formats"),
-        ("list-plugins", "list_plugins:list_plugins", "what is installed, what is broken and why"),
-        ("schedule", "schedule:schedule", "a method's plan as a table"),
-    )):  # fmt: skip
+    for position, name, target, summary in (
+        (0, "run", "run:run", "train, encode, decode, evaluate, report: one scene"),
+        (1, "train", "train:train", "train one method on one scene"),
+        (2, "encode", "codec:encode", "a trained model to one file"),
+        (3, "decode", "codec:decode", "a file back to a model, from nothing but itself"),
+        (4, "eval", "evaluate:evaluate", "quality, speed and memory of an encoded scene"),
+        (6, "list-plugins", "list_plugins:list_plugins", "what is installed, what is broken and why"),
+        (7, "schedule", "schedule:schedule", "a method's plan as a table"),
+    ):
         registry.add(name, f"splatwizard_core.cli.{target}", summary=summary, position=position)
-    registry.add("truncate", "splatwizard_core.cli.truncate:truncate", summary="a shorter file of one with cuts",
-                 position=3.5)  # fmt: skip

@@ -28,6 +28,7 @@ from splatwizard_core.cli.options import init_option as init_option
 from splatwizard_core.cli.options import json_option as json_option
 from splatwizard_core.cli.options import methods_option as methods_option
 from splatwizard_core.cli.options import options as options
+from splatwizard_core.cli.options import part_options as part_options
 from splatwizard_core.cli.options import preset_option as preset_option
 from splatwizard_core.cli.options import print_facts as print_facts
 from splatwizard_core.cli.options import print_json as print_json
@@ -39,6 +40,7 @@ from splatwizard_core.cli.options import scene_option as scene_option
 from splatwizard_core.cli.options import seeds_option as seeds_option
 from splatwizard_core.cli.options import set_option as set_option
 from splatwizard_core.cli.paths import EXISTING as EXISTING
+from splatwizard_core.cli.paths import INPUT_FILE as INPUT_FILE
 from splatwizard_core.cli.paths import OUTPUT_FILE as OUTPUT_FILE
 from splatwizard_core.cli.paths import OUTPUT_FOLDER as OUTPUT_FOLDER
 from splatwizard_core.cli.paths import OUTPUT_PAGE as OUTPUT_PAGE
@@ -78,10 +80,10 @@ from splatwizard_core.runs.directory import OWN_FILES as OWN_FILES
 from splatwizard_core.runs.directory import RunRequest as RunRequest
 from splatwizard_core.runs.directory import run_directory as run_directory
 from splatwizard_core.runs.encode import encode as encode
-from splatwizard_core.runs.file_needs import missing_parts as missing_parts
 from splatwizard_core.runs.file_needs import missing_plugin as missing_plugin
 from splatwizard_core.runs.identity import recorded_hash as recorded_hash
 from splatwizard_core.runs.measure import open_subject as open_subject
+from splatwizard_core.runs.measure import opener as opener
 from splatwizard_core.runs.observers import FinishedRun as FinishedRun
 from splatwizard_core.runs.observers import FinishedRuns as FinishedRuns
 from splatwizard_core.runs.observers import StartedTraining as StartedTraining

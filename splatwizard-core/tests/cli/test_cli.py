@@ -23,7 +23,7 @@ from splatwizard_core.runs import file_needs
 
 assert file_needs  # here, so that it does not keep the catalogue of a test that imports it first
 COMMANDS = (
-    "run", "train", "encode", "decode", "truncate", "eval", "export", "list-plugins", "schedule",
+    "run", "train", "encode", "decode", "eval", "list-plugins", "schedule",
 )  # fmt: skip
 """Of the core."""
 
@@ -126,14 +126,11 @@ def test_a_run_that_no_package_reports_ends_in_a_line(tmp_path: Path, monkeypatc
         (["eval", "/nowhere/scene.swz"], "there is no such file"),
         (["eval", "{text}", "--scene", "demo:tiny"], "not a .swz file"),
         (["encode", "{text}"], "takes a run directory or a .ply"),
-        (["export", "{text}", "x.ply"], "not a .swz file"),
         (["run", "--scene", ""], "--scene is empty"),
         (["run", "--method", ""], "--method is empty"),
         (["run", "--scene", "demo:tiny", "--out", "{text}"], "cannot write into {text}: it is a file"),
         (["train", "--scene", "demo:tiny", "--out", "{text}"], "cannot write into {text}: it is a file"),
         (["decode", "{folder}"], "{folder} is a folder, and this command takes a file"),
-        (["export", "{folder}", "x.ply"], "{folder} is a folder, and this command takes a file"),
-        (["export", "{text}", "{folder}/none/x.ply"], "there is no folder {folder}/none"),
         (["decode", "{text}", "--out", "{folder}"], "{folder} is a folder: give the name of a file in it"),
         (["encode", "{text}", "--out", "{folder}/none/x.swz"], "there is no folder {folder}/none"),
         (["eval", "{text}", "--metrics", ","], "--metrics is empty"),
@@ -285,13 +282,7 @@ def test_decoding_a_file_of_a_method_that_is_not_installed_says_what_to_install(
     )
 
 
-def test_ply_files_are_measured_drawn_and_exported(tmp_path: Path, capsys: pytest.CaptureFixture[str], ply: Path):
-    assert main(["export", str(ply), str(tmp_path / "again.ply"), "--json"]) == 0
-    capsys.readouterr()
-    assert (tmp_path / "again.ply").read_bytes() == ply.read_bytes()
-    assert main(["export", str(ply), str(tmp_path / "x.mars")]) == 2
-    assert "no installed exporter writes '.mars' files" in capsys.readouterr().err
-
+def test_ply_files_are_measured_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str], ply: Path):
     force = ["--set", "raster.prefer=reference"]
     measure = ["eval", str(ply), "--scene", "demo:tiny", "--no-speed", "--metrics", "psnr,l1"]
     folder = str(tmp_path / "views")

@@ -6,10 +6,8 @@ import pytest
 import torch
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-from splatwizard_core.errors import UserInputError
 from splatwizard_core.gaussians.model import GaussianModel, as_origin
-from splatwizard_core.gaussians.placement import in_world, placed_in, with_origin
-from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.gaussians.placement import placed_in, with_origin
 from splatwizard_core.scene.scene import Protocol, Scene
 
 FAR = (448262.0, 5411933.0, 35.0)
@@ -50,17 +48,6 @@ def test_scenes_about_0_leave_models_alone():
     model = model_at()
     before = model.digest()
     assert placed_in(model, scene_at((0.0, 0.0, 0.0))).digest() == before
-
-
-def test_the_world_is_asked_for_only_where_it_is_known():
-    model = model_at()
-    with pytest.raises(UserInputError, match=r"--world: m\.ply does not say where its origin lies"):
-        in_world(model, "m.ply")
-    with pytest.raises(UserInputError, match=r"--world: m\.swz holds no explicit Gaussians, its own.*sw bake"):
-        in_world(type("Anchors", (SplatModel,), {})(), "m.swz")
-    with_origin(model, FAR)
-    assert model.world_shift is None
-    assert in_world(model, "m.ply").world_shift == FAR
 
 
 @pytest.mark.parametrize("value", [None, 3, "abc", [1, 2], [1, 2, "3"], [1.0, 2.0, float("nan")], [True, 1, 2], {}])

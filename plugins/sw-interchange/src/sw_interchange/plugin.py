@@ -1,6 +1,12 @@
-"""Registers importers, exporters, methods and codecs of the formats that other programs use."""
+"""Registers `sw export`, and importers, exporters, methods and codecs of the formats that other programs use."""
 
 from splatwizard_core.api import Registry, hookimpl
+
+
+@hookimpl
+def register_commands(registry: Registry) -> None:
+    registry.add("export", "sw_interchange.export_command:export", position=5,
+                 summary=".ply and other interchange formats")  # fmt: skip
 
 
 @hookimpl

@@ -1,4 +1,4 @@
-"""Registers `sw lod`, and the codec that writes a scene in tiles."""
+"""Registers `sw lod` and `sw truncate`, and the codec that writes a scene in tiles."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ from splatwizard_core.api import Registry, hookimpl
 @hookimpl
 def register_commands(registry: Registry[Any]) -> None:
     registry.add("lod", "sw_lod.command:lod", position=4.3, summary="a scene in pieces and levels, for streaming")
+    registry.add(
+        "truncate", "sw_lod.truncate_command:truncate", position=3.5, summary="a shorter file of one with cuts"
+    )
 
 
 @hookimpl

@@ -73,11 +73,14 @@ def _head(path: Path, count: int = -1) -> bytes:
 
 def _file_facts(path: Path) -> dict[str, Any]:
     """Header and bytes by section of a .swz, which sum to its size; and what is missing here to decode it, and why."""
-    from splatwizard_core.tooling import missing_parts, missing_plugin
+    from splatwizard_core.tooling import missing_plugin
 
     reader, plugins = ContainerReader.open(path), load_plugins()
+    parts = [("method", reader.method), *(part for each in reader.requires for part in each.provided)]
+    # What several installed plugins quarrel over is not missing.
+    there = {(kind, n) for kind, each in plugins.registries.items() for n in (*each.names, *each.clashes)}
     missing = {f"{kind} {name}": str(missing_plugin(reader, plugins, kind, name))
-               for kind, name in missing_parts(reader, plugins)}  # fmt: skip
+               for kind, name in parts if (kind, name) not in there}  # fmt: skip
     return {"path": str(path), **reader.summary(), "missing": missing}
 
 

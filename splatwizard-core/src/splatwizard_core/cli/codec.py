@@ -6,10 +6,10 @@ from pathlib import Path
 
 import click
 
+from splatwizard_core.base.progress import counted
 from splatwizard_core.cli import options as shared
 from splatwizard_core.cli.paths import EXISTING, INPUT_FILE, OUTPUT_FILE, existing, output_file
 from splatwizard_core.cli.setup import Choices, open_session, takes_choices
-from splatwizard_core.cli.truncate import part_options
 from splatwizard_core.plugins import load_plugins
 
 
@@ -68,7 +68,7 @@ def encode(source: Path, out: Path | None, no_psnr: bool, as_json: bool, chosen:
         help="Timed decodes after the first one; their median is reported.",
     ),
     click.option("--hash", "hash_only", is_flag=True, help="Print nothing but SHA-256 of the decoded parameters."),
-    *part_options("--bytes"),
+    *shared.part_options("--bytes"),
     shared.set_option, shared.device_option, shared.json_option, shared.debug_option,
 )  # fmt: skip
 @takes_choices
@@ -95,5 +95,5 @@ def decode(
     printed = facts.model_dump(mode="json") | ({} if out is None else {"out": str(out)})
     many = "1 packet" if facts.packets == 1 else f"{facts.packets} packets"
     part = f"{many}, {facts.bytes:,} bytes, " if facts.packets else ""
-    told = f"{part}{shared.counted(facts.counts)}, decoded in {facts.decode_s:.3f} s on {facts.device}"
+    told = f"{part}{counted(facts.counts)}, decoded in {facts.decode_s:.3f} s on {facts.device}"
     shared.print_facts(printed, as_json, f"{facts.method}: {told}\nmodel digest {facts.digest}")

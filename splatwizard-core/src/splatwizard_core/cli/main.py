@@ -18,8 +18,8 @@ from splatwizard_core.cli.complete import COMPLETION_VARIABLE, completing_comman
 from splatwizard_core.cli.streams import abandon_streams, ended_like_ctrl_c, open_streams, without_orders
 from splatwizard_core.errors import FULL, DiskFullError, PluginError, TaskError
 from splatwizard_core.plugins import load_plugins
-from splatwizard_core.plugins.catalogue import package_of
 from splatwizard_core.plugins.origins import Origins
+from splatwizard_core.plugins.registry import nearest
 from splatwizard_core.plugins.remedies import as_installed
 from splatwizard_core.plugins.strangers_code import exits_are_raised
 from splatwizard_native import ForeseenError, shortened
@@ -72,13 +72,7 @@ class LazyGroup(click.Group):
         try:
             return super().resolve_command(ctx, args)
         except click.UsageError as error:
-            package = package_of("command", args[0])
-            import difflib
-
-            near = difflib.get_close_matches(args[0], self.list_commands(ctx), n=1)
-            hint = f"did you mean '{near[0]}'?" if near else "`sw --help` lists all"
-            if package is not None:
-                hint = f"it comes with {package}: pip install {package}"
+            hint = nearest("command", args[0], self.list_commands(ctx))
             raise click.UsageError(f"no command '{args[0]}': {hint}", ctx) from error
 
 

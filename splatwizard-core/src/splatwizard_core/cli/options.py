@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
@@ -147,6 +147,28 @@ size_options = options(  # of a training; a method takes those that are keys of 
 )  # fmt: skip
 
 
+def _size_of_part(context: click.Context, _parameter: click.Parameter, given: str | None) -> int | None:
+    from splatwizard_core.base.values import parse_size
+
+    if given is None:
+        return None
+    if context.params.get("packets") is not None:
+        raise click.UsageError("--packets and a size each choose a cut: give one of them")
+    return parse_size(given)
+
+
+def part_options(size: str) -> Sequence[Callable[[F], F]]:
+    """Return the options for a part of a file with cuts, parameters packets, size and partial; `size` is called so."""
+    return (
+        click.option("--packets", type=click.IntRange(min=1), metavar="P", is_eager=True,
+                     help="With cuts: the first P packets.  [default: all]"),
+        click.option(size, "size", metavar="SIZE", callback=_size_of_part,
+                     help="With cuts: the packets that fit, as into 500kB or 2MiB.  [default: all]"),
+        click.option("--partial", is_flag=True,
+                     help="With cuts: the packets before the place where a file ends early or is damaged."),
+    )  # fmt: skip
+
+
 def say(message: str) -> None:
     """Print a line for the user on stderr: stdout holds results only."""
     click.echo(without_orders(as_installed(shortened(message))), err=True)
@@ -167,11 +189,6 @@ def print_facts(facts: dict[str, Any], as_json: bool, told: str | Callable[[dict
         click.echo(told)
     else:
         told(facts)
-
-
-def counted(counts: dict[str, int]) -> str:
-    """`120,331 gaussians`, of all that a model counts."""
-    return ", ".join(f"{n:,} {name.removeprefix('num_')}" for name, n in counts.items())
 
 
 def console() -> Console:

@@ -11,6 +11,8 @@ import sys
 import threading
 from collections.abc import Iterator
 
+from splatwizard_core.base.interrupt import ASKED_TO_END
+
 
 def open_streams() -> None:
     """Let standard streams that the caller closed (`sw info x >&-`) lead to nowhere, and take every character.
@@ -60,9 +62,8 @@ def ended_like_ctrl_c() -> Iterator[None]:
     So a training that a cluster stops writes a checkpoint first, also where Ctrl-C itself is ignored, as it is for what
     a script starts in the background. What ignores SIGHUP already (`nohup`) goes on so.
     """
-    asked = [signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)]  # Windows has no terminal that hangs up
     main = threading.current_thread() is threading.main_thread()
-    ended = [number for number in {*asked} if main and signal.getsignal(number) is signal.SIG_DFL]
+    ended = [number for number in ASKED_TO_END if main and signal.getsignal(number) is signal.SIG_DFL]
     for number in ended:
         signal.signal(number, signal.default_int_handler)
     try:

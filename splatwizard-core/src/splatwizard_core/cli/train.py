@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from splatwizard_core.base.progress import counted
 from splatwizard_core.cli import options as shared
 from splatwizard_core.cli.setup import Choices, only, open_training_session, takes_choices
 from splatwizard_core.plugins import load_plugins
@@ -37,5 +38,5 @@ def train(out: Path, resume: bool, allow_changed_plan: bool, as_json: bool, view
     trained, directory = train_only(session, RunRequest(only(resolved), out, resume, allow_changed_plan))
     facts: dict[str, Any] = {"directory": str(directory), "counts": trained.model.counts()}
     facts |= trained.facts.model_dump(mode="json", include=REPORTED)
-    told = f"{facts['steps']:,} steps in {facts['train_s']:.1f} s, {shared.counted(facts['counts'])}: {directory}"
+    told = f"{facts['steps']:,} steps in {facts['train_s']:.1f} s, {counted(facts['counts'])}: {directory}"
     shared.print_facts(facts, as_json, told)

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.base.files import replacing
-from splatwizard_core.base.progress import track
+from splatwizard_core.base.progress import counted, track
 from splatwizard_core.errors import BitstreamError, SceneError, out_of_memory
 from splatwizard_core.evaluation.image import prepare_render
 from splatwizard_core.evaluation.metrics import (
@@ -146,8 +146,7 @@ def render_view(model: SplatModel, camera: Camera, rasterizer: Rasterizer, optio
         with torch.no_grad():
             return rasterizer.render(model.gaussians(camera, rasterizer), camera, options)
     except torch.cuda.OutOfMemoryError as error:
-        counted = ", ".join(f"{n:,} {name.removeprefix('num_')}" for name, n in model.counts().items())
-        doing = f"a view of {counted} at {camera.width}x{camera.height}"
+        doing = f"a view of {counted(model.counts())} at {camera.width}x{camera.height}"
         raise out_of_memory(error, doing, "free the GPU, or compute with --device cpu") from error
 
 

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 Origin = tuple[float, float, float]
 WORLD_ORIGIN = "world_origin"
 """Key of a model's `origin`, and of a file's header: where the origin of its coordinates lies in the world."""
-AS_WORLD = "as_world"
-"""Key of a model's `origin`: whoever writes it next adds the world's origin to its coordinates."""
 
 
 def as_origin(value: Any) -> Origin | None:
@@ -119,7 +117,7 @@ class GaussianModel(SplatModel):
     @property
     def world_shift(self) -> Origin | None:
         """Shift (x, y, z) that an exporter adds to the coordinates, if those of the world are asked for; else None."""
-        return self.world_origin if self.origin.get(AS_WORLD) else None
+        return self.world_origin if self.origin.get("as_world") else None
 
     @property
     def max_sh_degree(self) -> int:

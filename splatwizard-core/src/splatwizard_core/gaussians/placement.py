@@ -7,8 +7,7 @@ from typing import TypeVar
 
 import torch
 
-from splatwizard_core.errors import UserInputError
-from splatwizard_core.gaussians.model import AS_WORLD, WORLD_ORIGIN, GaussianModel, Origin
+from splatwizard_core.gaussians.model import WORLD_ORIGIN, GaussianModel, Origin
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.scene.scene import Scene
 
@@ -50,25 +49,6 @@ def placed_in(model: AnyModel, scene: Scene, name: str = "the model") -> AnyMode
         with torch.no_grad():
             model.means.copy_(model.means.double() + shift.to(model.device))
     model.origin = {**model.origin, WORLD_ORIGIN: list(scene.origin)}
-    return model
-
-
-def in_world(model: SplatModel, name: str) -> SplatModel:
-    """The model, asked of the next exporter in the coordinates of the world: `origin` says `as_world`.
-
-    One that can hold doubles adds the world's origin in double precision, others do in float32 (`world_shift`).
-    Raises UserInputError for what is no explicit Gaussians, and where the file does not say where its origin lies.
-    """
-    if not isinstance(model, GaussianModel):
-        raise UserInputError(
-            f"--world: {name} holds no explicit Gaussians, its own depend on the camera; "
-            "`sw bake FILE OUT --scene SCENE` fits explicit ones, which keep the origin of the scene"
-        )
-    if model.world_origin is None:
-        raise UserInputError(
-            f"--world: {name} does not say where its origin lies: its scene was not moved, or another program wrote it"
-        )
-    model.origin = {**model.origin, AS_WORLD: True}
     return model
 
 

@@ -14,8 +14,9 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
+from splatwizard_core.base.interrupt import ASKED_TO_END
+
 Told = Callable[[str], None]  # takes what was changed, such as "the working folder"
-_ENDINGS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 _modes: list[Any] = []  # a mode of torch ends with its object
 
 
@@ -104,7 +105,7 @@ def kept_endings(tell: Told) -> Iterator[list[int]]:
         return lambda number, frame: came.append(number) or answer(number, frame)  # type: ignore[func-returns-value]
 
     is_main = threading.current_thread() is threading.main_thread()
-    answered = {n: answer for n in _ENDINGS if is_main and (answer := signal.getsignal(n)) is not None}
+    answered = {n: answer for n in ASKED_TO_END if is_main and (answer := signal.getsignal(n)) is not None}
     placed = {number: noting(answer) if callable(answer) else answer for number, answer in answered.items()}
     for number, answer in placed.items():
         signal.signal(number, answer)

@@ -13,17 +13,6 @@ from splatwizard_core.plugins.catalogue import CORE, catalogue, is_ours, normal_
 from splatwizard_core.plugins.versions import installed
 
 
-def missing_parts(reader: ContainerReader, plugins: PluginManager) -> list[tuple[str, str]]:
-    """List (kind, name) of the parts that the file was written with and nothing here provides.
-
-    What several installed plugins quarrel over is not missing.
-    """
-    registries = plugins.registries
-    there = {(kind, name) for kind, each in registries.items() for name in (*each.names, *each.clashes)}
-    parts = [("method", reader.method), *(part for each in reader.requires for part in each.provided)]
-    return [part for part in dict.fromkeys(parts) if part not in there]
-
-
 def missing_plugin(reader: ContainerReader, plugins: PluginManager, kind: str, name: str) -> PluginError:
     """Make the error for a file that needs what nothing here provides.
 

@@ -11,6 +11,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 from splatwizard_core.base.files import file_sha256
+from splatwizard_core.base.progress import counted
 from splatwizard_core.base.warned import WARNED
 from splatwizard_core.errors import SplatwizardError, UserInputError
 from splatwizard_core.evaluation.metrics import MetricSetup, chosen_metrics, metric_identities
@@ -56,8 +57,7 @@ def run(session: Session, request: RunRequest) -> tuple[schema.Record, Path]:
 
         def decode_it() -> DecodingFacts:
             facts = decode_fresh(encoded, str(session.device), repeats=repeats, threads=resolved.ppl.threads)
-            counted = ", ".join(f"{n:,} {name.removeprefix('num_')}" for name, n in facts.counts.items())
-            session.say(f"decoded in a fresh process: {facts.decode_s:.2f} s, {counted}")
+            session.say(f"decoded in a fresh process: {facts.decode_s:.2f} s, {counted(facts.counts)}")
             return facts
 
         def evaluate_it() -> Measurement:
