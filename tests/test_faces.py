@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 
 import pytest
+import torch
 from counted_lines import lines_of_process
 from import_graph import CORE, ROOT
 from torch import nn
@@ -37,6 +38,12 @@ def test_a_name_of_an_older_release_is_found_with_a_warning_and_not_listed(name)
         found = getattr(api, name)
     assert found(nn.Module()) is None  # a model of another kind says nothing of the world
     assert name not in api.__all__
+
+
+def test_the_older_name_of_a_colours_coefficient_works():
+    vars(api).pop("rgb_to_dc", None)
+    with pytest.warns(DeprecationWarning, match="goes with 0.4"):
+        assert api.rgb_to_dc(torch.tensor(0.5)) == 0
 
 
 def test_the_api_is_small():

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from splatwizard_core.api import parse_size
 from splatwizard_core.cli.main import main
-from splatwizard_core.tooling import parse_size
 
 GOLDEN = Path(__file__).parent / "golden"
 PACKETS = GOLDEN / "3dgs_packets_v1.swz"

@@ -13,7 +13,7 @@ from sw_gaussians.picture_psnr import capped_psnr
 from sw_gaussians.ply import export_ply, load_ply
 from sw_report.attribute_errors import attribute_errors
 
-from splatwizard_core.api import GaussianModel, UserInputError, rgb_to_dc
+from splatwizard_core.api import SH_C0, GaussianModel, UserInputError
 from splatwizard_core.cli.main import main
 
 GOLDEN = Path(__file__).parents[3] / "tests" / "golden"
@@ -42,7 +42,7 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, Any
 
 def test_known_errors_are_measured():
     a = model_of()
-    b = changed(a, means=torch.tensor([3e-3, 0.0, 4e-3]), log_scales=-0.01, sh_dc=float(rgb_to_dc(torch.tensor(0.52))),
+    b = changed(a, means=torch.tensor([3e-3, 0.0, 4e-3]), log_scales=-0.01, sh_dc=0.02 / SH_C0,
                 sh_rest=0.03)  # fmt: skip
     found = attribute_errors(a, b)
     assert found is not None

@@ -5,7 +5,9 @@
 
 from splatwizard_native import lazy_exports
 
-OLDER = {"splatwizard_core.gaussians.placement": "origin_of world_shift"}
+OLDER = {
+    "splatwizard_core.gaussians.inputs": "rgb_to_dc", "splatwizard_core.gaussians.placement": "origin_of world_shift",
+}  # fmt: skip
 """Names of 0.2 that go with 0.4."""
 
 __all__, __getattr__ = lazy_exports(__name__, OLDER)

@@ -1,5 +1,6 @@
 from splatwizard_core.base.files import replacing as replacing
 from splatwizard_core.base.progress import track as track
+from splatwizard_core.base.values import parse_size as parse_size
 from splatwizard_core.coding.container import ContainerReader as ContainerReader
 from splatwizard_core.coding.container import ContainerWriter as ContainerWriter
 from splatwizard_core.coding.contracts import ArrayCoder as ArrayCoder
@@ -28,7 +29,6 @@ from splatwizard_core.evaluation.metrics import PreparedMetric as PreparedMetric
 from splatwizard_core.gaussians.inputs import SH as SH
 from splatwizard_core.gaussians.inputs import SH_C0 as SH_C0
 from splatwizard_core.gaussians.inputs import GaussianInputs as GaussianInputs
-from splatwizard_core.gaussians.inputs import rgb_to_dc as rgb_to_dc
 from splatwizard_core.gaussians.invalid_rows import LeftOut as LeftOut
 from splatwizard_core.gaussians.invalid_rows import leave_out_senseless as leave_out_senseless
 from splatwizard_core.gaussians.model import GaussianModel as GaussianModel

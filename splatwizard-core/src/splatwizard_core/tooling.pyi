@@ -13,7 +13,6 @@ from splatwizard_core.base.progress import Bar as Bar
 from splatwizard_core.base.progress import duration as duration
 from splatwizard_core.base.strict_json import json_reason as json_reason
 from splatwizard_core.base.toml_file import read_toml as read_toml
-from splatwizard_core.base.values import parse_size as parse_size
 from splatwizard_core.cli.complete import COMPLETION_VARIABLE as COMPLETION_VARIABLE
 from splatwizard_core.cli.complete import SCENE as SCENE
 from splatwizard_core.cli.complete import SCENE_OR_FILE as SCENE_OR_FILE

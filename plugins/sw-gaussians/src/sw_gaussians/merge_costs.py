@@ -8,9 +8,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from splatwizard_core.api import SH_C0
 from sw_gaussians.merging import Splats, covariances, surface
 
-SH_C0 = 0.28209479177387814
 COLOR_PRICE = 4 * math.pi * 1e-6
 """Of a squared difference of colour: keeps fine texture from being merged where its volume is next to nothing."""
 SMALLEST = 1e-36

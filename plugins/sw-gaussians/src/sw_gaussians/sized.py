@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar, runtime_checkable
 
 from pydantic import Field
 
-from splatwizard_core.api import ConfigError
-from sw_gaussians.byte_sizes import ByteSize, parse_size
+from splatwizard_core.api import ConfigError, parse_size
+from sw_gaussians.byte_sizes import ByteSize
 from sw_gaussians.choices import CodecChoice
 from sw_gaussians.density.adc import GradientSettings
 from sw_gaussians.density.choice import DensityChoice

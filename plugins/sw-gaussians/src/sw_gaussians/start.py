@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from splatwizard_core.api import GaussianModel, PointCloud, Scene, SceneError, rgb_to_dc
+from splatwizard_core.api import SH_C0, GaussianModel, PointCloud, Scene, SceneError
 from sw_gaussians.knn import mean_squared_neighbor_distance
 from sw_gaussians.surfels import SurfelModel
 
@@ -119,6 +119,6 @@ def _usable(points: PointCloud) -> tuple[Tensor, Tensor, Tensor]:
         log.warning("the %d start points have no colours; they start grey", n)
         sh_dc = xyz.new_zeros(n, 1, 3)
     else:
-        sh_dc = rgb_to_dc(rgb.to(xyz))[:, None, :]
+        sh_dc = ((rgb.to(xyz) - 0.5) / SH_C0)[:, None, :]
     squared = mean_squared_neighbor_distance(xyz).clamp_min(MIN_SQUARED_DISTANCE)
     return xyz, sh_dc, squared.sqrt()

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from sw_gaussians.memory_map import memory_map
 
-from splatwizard_core.api import BitstreamError, UserInputError
+from splatwizard_core.api import SH_C0, BitstreamError, UserInputError
 from sw_interchange.bands import Array
 from sw_interchange.known_formats import MAX_META
 from sw_interchange.quats import ROOT_2, from_smallest_three
@@ -33,7 +33,6 @@ ROW = np.dtype([
 ])  # fmt: skip
 SH_BYTES = 64
 """Of a row in shcoef.bin: 15 words of a coefficient in red, green and blue, and one to spare."""
-SH_C0 = 0.28209479177387814
 LARGEST = 1e6
 """Of a bound of scales or coefficients."""
 

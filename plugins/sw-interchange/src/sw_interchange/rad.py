@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from sw_gaussians.memory_map import memory_map
 
-from splatwizard_core.api import BitstreamError, UserInputError
+from splatwizard_core.api import SH_C0, BitstreamError, UserInputError
 from sw_interchange.bands import COEFFICIENTS, Array
 from sw_interchange.rad_encodings import BYTES, WHOLE, decoded, inflated, whole_numbers
 from sw_interchange.scene import FLAT, LARGEST_LOGIT, GaussianScene, Limits, ReadReport, decoded_bytes
@@ -31,7 +31,6 @@ MAX_ROWS = 1 << 26
 MAX_PROPERTIES = 64
 MAX_DEPTH = 4096
 MAX_LEVEL = 32
-SH_C0 = 0.28209479177387814
 WIDTHS = {"center": 3, "alpha": 1, "rgb": 3, "scales": 3, "orientation": 3, "sh1": 9, "sh2": 15, "sh3": 21,
           "child_count": 1, "child_start": 1}  # fmt: skip
 NEEDED = ("center", "alpha", "rgb", "scales", "orientation")

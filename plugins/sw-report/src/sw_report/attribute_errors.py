@@ -6,12 +6,11 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from sw_gaussians.covariances import covariances_of
 
-from splatwizard_core.api import GaussianModel, rgb_to_dc
+from splatwizard_core.api import SH_C0, GaussianModel
 
 Array = NDArray[np.float64]
 
@@ -117,7 +116,7 @@ class _Columns:
         with np.errstate(over="ignore"):
             opacities = 1 / (1 + np.exp(-values["opacity_logits"]))
         quats = values["quats"] / np.maximum(np.linalg.norm(values["quats"], axis=1, keepdims=True), 1e-12)
-        steps = float(rgb_to_dc(torch.tensor(1.5)))  # of the coefficient for one of the colour
+        steps = 1 / SH_C0  # of the coefficient for one of the colour
         colors = 0.5 + values["sh_dc"][:, 0] / steps
         found = cls(values["means"], np.maximum(scales, FLAT), quats, opacities, colors, rest)
         sound = np.ones(n, dtype=bool)
