@@ -8,14 +8,10 @@ reader of splat-transform as documented, and its results on files made here.
 from __future__ import annotations
 
 import json
-import os
-import stat
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from sw_gaussians.memory_map import memory_map
 
 from splatwizard_core.api import SH_C0, BitstreamError, UserInputError
 from sw_interchange.bands import Array
@@ -48,7 +44,7 @@ def read_lcc(source: Source, limits: Limits, report: ReadReport) -> GaussianScen
     low, high = _range(source, meta, "scale")
     if low.min() < 0:
         raise BitstreamError(f"{source.name}: the range of its scales begins below 0")
-    data = _beside(source, "data.bin")
+    data = source.beside("data.bin")
     ranges = _ranges(source, levels, len(data))
     count = sum(points for _, points in ranges)
     # Portable files list the range of coefficients that they do not have.
@@ -108,24 +104,11 @@ def _range(source: Source, meta: dict[str, Any], name: str) -> tuple[Array, Arra
     return found[0], found[1]
 
 
-def _beside(source: Source, name: str) -> bytes | memoryview:
-    if source.path is None:
-        raise BitstreamError(f"{source.name}: its rows lie in other files: read meta.lcc where they are")
-    path = Path(source.path).parent / name
-    try:
-        regular = stat.S_ISREG(os.stat(path).st_mode)
-    except OSError as error:
-        raise BitstreamError(f"{source.name}: '{name}' beside it cannot be read: {error.strerror}") from error
-    if not regular:
-        raise BitstreamError(f"{source.name}: '{name}' beside it is no file")
-    return memory_map(path)
-
-
 def _ranges(source: Source, levels: int, size: int) -> list[tuple[int, int]]:
     """Offset in data.bin and number of rows of each cell of the level, without the empty ones."""
     entry = np.dtype([("points", "<i4"), ("offset", "<i8"), ("bytes", "<i4")])
     cell = np.dtype([("place", "<i2", 2), ("levels", entry, levels)])
-    index = _beside(source, "index.bin")
+    index = source.beside("index.bin")
     if len(index) % cell.itemsize or len(index) > MAX_CELLS * cell.itemsize:
         raise BitstreamError(
             f"{source.name}: index.bin has {len(index):,} bytes, no multiple of {cell.itemsize} or too many"
@@ -152,7 +135,7 @@ def _quats(words: npt.NDArray[np.uint32]) -> Array:
 
 def _sh_rest(source: Source, meta: dict[str, Any], ranges: list[tuple[int, int]], report: ReadReport) -> Array:
     low, high = _range(source, meta, "shcoef")
-    data = _beside(source, "shcoef.bin")
+    data = source.beside("shcoef.bin")
     report.bytes += len(data)
     if any(2 * offset + SH_BYTES * points > len(data) for offset, points in ranges):
         raise BitstreamError(f"{source.name}: shcoef.bin of {len(data):,} bytes does not reach to all rows of data.bin")

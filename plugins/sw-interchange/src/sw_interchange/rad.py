@@ -8,14 +8,11 @@ Spark's repository, June 2026.
 from __future__ import annotations
 
 import json
-import os
-import stat
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from sw_gaussians.memory_map import memory_map
 
 from splatwizard_core.api import SH_C0, BitstreamError, UserInputError
 from sw_interchange.bands import COEFFICIENTS, Array
@@ -155,16 +152,7 @@ def _opened(content: memoryview, told: dict[str, Any], base: int, total: int, na
 def _beside(source: Source, file: Any, name: str) -> memoryview:
     if not isinstance(file, str) or not is_plain(file) or not file.lower().endswith(".radc"):
         raise BitstreamError(f"{name}: its file {file!r:.40} is no plain name that ends in .radc")
-    if source.path is None:
-        raise BitstreamError(f"{name}: lies in another file: read the .rad where it is")
-    path = source.path.parent / file
-    try:
-        regular = stat.S_ISREG(os.lstat(path).st_mode)
-    except OSError as error:
-        raise BitstreamError(f"{name}: '{file}' cannot be read: {error.strerror}") from error
-    if not regular:
-        raise BitstreamError(f"{name}: '{file}' is no file")
-    return memoryview(memory_map(path))
+    return memoryview(source.beside(file))
 
 
 def _properties(chunk: _Chunk, degree: int) -> tuple[dict[str, Any], set[str]]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import stat
 from collections.abc import Callable
 from pathlib import PurePosixPath
 from typing import Any
@@ -61,22 +60,13 @@ class _Bundle:
         return files[name]
 
     def _beside(self, source: Source, name: str) -> bytes:
-        if source.path is None:
-            raise BitstreamError(f"{self.name}: its images lie in other files: read the folder")
-        where = source.path.parent / name
-        try:
-            told = where.stat()  # before it is opened: opening a pipe waits for a writer
-            if not stat.S_ISREG(told.st_mode):
-                raise BitstreamError(f"{self.name}: '{name}', which it names, is no file")
-            if told.st_size > self.largest:
-                raise BitstreamError(
-                    f"{self.name}: '{name}', which it names, has {told.st_size:,} bytes; {self.largest:,} are the most"
-                )
-            self.size += told.st_size
-            with where.open("rb") as file:
-                return file.read(self.largest)
-        except OSError as error:
-            raise BitstreamError(f"{self.name}: '{name}', which it names, cannot be read: {error.strerror}") from error
+        content = source.beside(name)
+        if len(content) > self.largest:
+            raise BitstreamError(
+                f"{self.name}: '{name}', which it names, has {len(content):,} bytes; {self.largest:,} are the most"
+            )
+        self.size += len(content)
+        return bytes(content)
 
     def _parsed(self, text: bytes) -> dict[str, Any]:
         def refuse(word: str) -> float:

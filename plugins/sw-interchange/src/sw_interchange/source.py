@@ -9,6 +9,8 @@ from typing import Any
 
 from sw_gaussians.memory_map import memory_map
 
+from splatwizard_core.api import BitstreamError, SceneError
+
 
 @dataclass(frozen=True)
 class Source:
@@ -32,6 +34,19 @@ class Source:
         """Map a file. Raises SceneError if it cannot be read."""
         where = Path(path)
         return cls(memory_map(where), where.name, where, **options)
+
+    def beside(self, name: str) -> bytes | memoryview:
+        """Map another file of the same folder, a plain name; links are followed. Raises BitstreamError."""
+        if self.path is None:
+            raise BitstreamError(
+                f"{self.name}: '{name}', which belongs to it, lies in another file: read both in place"
+            )
+        where = self.path.parent / name
+        try:
+            return memory_map(where)
+        except SceneError as error:
+            reason = str(error).removeprefix(f"{where}: ")
+            raise BitstreamError(f"{self.name}: '{name}', which belongs to it, {reason}") from error
 
     def head(self, count: int) -> bytes:
         """The first bytes, at most `count`."""
