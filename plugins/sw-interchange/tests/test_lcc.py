@@ -140,6 +140,13 @@ def test_a_file_that_is_missing_or_short_is_told(folder, name):
     assert name in refused(folder / "meta.lcc")
 
 
+def test_a_link_beside_the_description_is_followed(folder, tmp_path):
+    count = len(read(folder / "meta.lcc").means)
+    (folder / "data.bin").rename(tmp_path / "elsewhere.bin")
+    (folder / "data.bin").symlink_to(tmp_path / "elsewhere.bin")
+    assert len(read(folder / "meta.lcc").means) == count
+
+
 def test_no_such_level_is_told(folder):
     with pytest.raises(UserInputError, match="levels 0 to 1"):
         read(folder / "meta.lcc", level=2)

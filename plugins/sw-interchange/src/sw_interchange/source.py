@@ -10,6 +10,7 @@ from typing import Any
 from sw_gaussians.memory_map import memory_map
 
 from splatwizard_core.api import BitstreamError, SceneError
+from splatwizard_core.tooling import json_reason as json_reason
 
 
 @dataclass(frozen=True)
@@ -38,9 +39,7 @@ class Source:
     def beside(self, name: str) -> bytes | memoryview:
         """Map another file of the same folder, a plain name; links are followed. Raises BitstreamError."""
         if self.path is None:
-            raise BitstreamError(
-                f"{self.name}: '{name}', which belongs to it, lies in another file: read both in place"
-            )
+            raise BitstreamError(f"{self.name}: '{name}' belongs to it and lies in another file: read them in place")
         where = self.path.parent / name
         try:
             return memory_map(where)
@@ -51,8 +50,3 @@ class Source:
     def head(self, count: int) -> bytes:
         """The first bytes, at most `count`."""
         return bytes(self.data[:count])
-
-
-def json_reason(error: Exception) -> str:
-    """Say why text is no JSON, after what `json.loads` raised."""
-    return "its brackets are nested too deeply" if isinstance(error, RecursionError) else str(error)
