@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sw_gaussians.rows
 import torch
 from torch import Tensor
 
@@ -13,9 +14,8 @@ IMPORTANCE = "importance"
 
 @torch.no_grad()
 def select(model: GaussianModel, rows: Tensor) -> GaussianModel:
-    """The Gaussians of an index [M] or mask [N], in that order."""
-    raw = {name: getattr(model, name).detach()[rows].contiguous() for name in model.RAW}
-    part = like(model, type(model)(**raw, active_sh_degree=model.active_sh_degree))
+    """The Gaussians of an index [M] or mask [N], in that order, with their importance."""
+    part = sw_gaussians.rows.select(model, rows)
     known = getattr(model, IMPORTANCE, None)
     if known is not None:
         setattr(part, IMPORTANCE, known[rows])

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from splatwizard_core.api import Camera, GaussianModel, RasterOptions, SceneError
 from sw_gaussians.render_options import antialias_of, eps2d_of
+from sw_gaussians.rows import select
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Rasterizer
@@ -176,9 +177,7 @@ def _judged(model: GaussianModel, rasterizer: Rasterizer) -> tuple[_Judged, Exte
     rows = np.flatnonzero(sound)
     if len(rows) > MOST_JUDGED:
         rows = np.sort(rows[np.argsort(-areas[rows], kind="stable")[:MOST_JUDGED]])
-    index = torch.from_numpy(rows).to(model.device)
-    raw = {name: getattr(model, name).detach()[index] for name in model.RAW}
-    part = type(model).from_tensors(**raw, active_sh_degree=model.active_sh_degree)
+    part = select(model, torch.from_numpy(rows).to(model.device))
     options = RasterOptions(alpha=True, antialias=antialias_of(model), eps2d=eps2d_of(model))
     middles = scales[rows, 1]
     return _Judged(part, points[rows], middles, areas[rows], rasterizer, options), extent

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import Field
+from sw_gaussians.rows import select
 from sw_gaussians.simplifying import merged_to
 
 from splatwizard_core.api import BitstreamError, GaussianModel, ShapeError
@@ -103,7 +104,7 @@ def encode(model: GaussianModel, writer: ContainerWriter, settings: TileSettings
     for layer in range(settings.layers if n else 0):
         left = np.flatnonzero(layer_of > layer)
         share = settings.stand_ins if layer else settings.coarsest
-        coarse = _stand_ins(_rows(scene, left), weights[left], math.ceil(n / share))
+        coarse = _stand_ins(select(scene, torch.from_numpy(left)), weights[left], math.ceil(n / share))
         stages.append(_lattice(coarse, settings, positions, found.layout.grid))
     tiles = _Tiles(found.cells, settings)
     groups = _ordered(found, layer_of, stages, tiles, worth)
@@ -148,12 +149,6 @@ def _drawn(model: GaussianModel) -> GaussianModel:
         keep &= (~flat.isnan() if name == "opacity_logits" else flat.isfinite()).all(dim=1)
     kept = {name: values[keep] for name, values in raw.items()}
     return type(model)(**kept, active_sh_degree=model.active_sh_degree)
-
-
-def _rows(model: GaussianModel, rows: NDArray[np.int64]) -> GaussianModel:
-    index = torch.from_numpy(rows)
-    raw = {name: getattr(model, name).detach()[index] for name in model.RAW}
-    return type(model)(**raw, active_sh_degree=model.active_sh_degree).eval().requires_grad_(False)
 
 
 def _stand_ins(model: GaussianModel, weights: NDArray[np.float64], count: int) -> GaussianModel:
