@@ -39,7 +39,6 @@ def test_blender_scenes_are_trained_on_black_and_room_with_both_splits(trainings
     (tmp_path / "lego").mkdir()
     (tmp_path / "lego" / "transforms_test.json").write_text("{}")
     cells = trainings.training_cells(tmp_path, ["lego", "room"], None)
-    sector = (f"split={trainings.SECTOR}",)
     told = {(cell.label, cell.rate, Path(cell.scene).name, cell.sets) for cell in cells}
     assert told == {
         ("3dgs", "r6", "lego", ("background=black",)),

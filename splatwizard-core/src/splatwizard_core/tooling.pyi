@@ -11,6 +11,7 @@ from splatwizard_core.base.memory import reset_peak_rss as reset_peak_rss
 from splatwizard_core.base.memory import rss_bytes as rss_bytes
 from splatwizard_core.base.progress import Bar as Bar
 from splatwizard_core.base.progress import duration as duration
+from splatwizard_core.base.progress import several as several
 from splatwizard_core.base.strict_json import json_reason as json_reason
 from splatwizard_core.base.toml_file import read_toml as read_toml
 from splatwizard_core.cli.complete import COMPLETION_VARIABLE as COMPLETION_VARIABLE

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping, Sequence
 
-from splatwizard_core.tooling import duration, print_json, print_table, say
+from splatwizard_core.tooling import duration, print_json, print_table, say, several
 from sw_bench.cells import Cell, Job, Layout
 from sw_bench.display import SLOTS_UNKNOWN
 from sw_bench.estimates import Estimates
@@ -66,4 +66,4 @@ def plan_size(cells: Sequence[Cell]) -> str:
         "method": len({cell.label for cell in cells}), "scene": len({cell.scene for cell in cells}),
         "seed": len({cell.seed for cell in cells}),
     }  # fmt: skip
-    return " x ".join(f"{n} {name}{'s' * (n != 1)}" for name, n in sizes.items())
+    return " x ".join(several(n, name) for name, n in sizes.items())

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 from splatwizard_core.api import SceneError, View
+from splatwizard_core.tooling import several
 from sw_datasets.sectors import sector_of
 
 T = TypeVar("T")
@@ -125,7 +126,7 @@ def sparse_indices(count: int, rule: str) -> list[int]:
 def _check_halves(rule: str, count: int, train: Sequence[object], test: Sequence[object]) -> None:
     if not train or not test:
         raise SceneError(
-            f"split '{rule}' of {count} view{'s' * (count != 1)} gives {len(train)} to train and "
+            f"split '{rule}' of {several(count, 'view')} gives {len(train)} to train and "
             f"{len(test)} to test: both need at least 1 (at least 2 views in all); add views or use split 'all'"
         )
 

@@ -6,7 +6,16 @@ from pathlib import Path
 
 import click
 
-from splatwizard_core.tooling import EXISTING, debug_option, device_option, json_option, options, print_facts, say
+from splatwizard_core.tooling import (
+    EXISTING,
+    debug_option,
+    device_option,
+    json_option,
+    options,
+    print_facts,
+    say,
+    several,
+)
 
 
 class Count(click.ParamType):  # type: ignore[type-arg]  # generic only in new releases of click
@@ -49,19 +58,15 @@ def lod(file: Path, out: str, levels: int | None, chunk: int | None, device: str
     record = write_lod(file, out, levels=levels, chunk=chunk, device=device or "auto", say=say)
     if "packets" in record:
         ends = record["packets"]
-        packets = _several(len(ends), "packet")
+        packets = several(len(ends), "packet")
         told = f"{record['out']}: {ends[-1]:,} bytes in {packets}, the whole scene coarsely in {ends[0]:,}"
         print_facts(record, as_json, told)
         return
     counts = ", ".join(f"{count:,}" for count in record["counts"])
     told = (
-        f"{record['out']}: {_several(len(record['counts']), 'level')} ({counts} Gaussians) in "
-        f"{_several(record['leaves'], 'piece')}, {_several(record['units'], 'unit')} of {record['bytes']:,} bytes"
+        f"{record['out']}: {several(len(record['counts']), 'level')} ({counts} Gaussians) in "
+        f"{several(record['leaves'], 'piece')}, {several(record['units'], 'unit')} of {record['bytes']:,} bytes"
     )
     for line in record["warnings"]:
         say(line)
     print_facts(record, as_json, told)
-
-
-def _several(count: int, noun: str) -> str:
-    return f"{count:,} {noun}{'' if count == 1 else 's'}"

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from splatwizard_core.tooling import several
 from sw_report.rate_distortion import pareto_front
 
 
@@ -51,7 +52,7 @@ def at_equal(curve: Sequence[CurvePoint], psnr: float | None, size: float | None
     points = {point.rate: point for point in curve}
     sizes, scores = pareto_front([p.bytes for p in points.values()], [p.psnr for p in points.values()])
     if len(sizes) < 2:
-        return AtEqual(why=f"{len(points)} rate point{'s' * (len(points) != 1)} measured here, a curve needs two")
+        return AtEqual(why=f"{several(len(points), 'rate point')} measured here, a curve needs two")
     logs = np.log(sizes)
     here = None if size is None or not sizes[0] <= size <= sizes[-1] else float(np.interp(math.log(size), logs, scores))
     gain = None if here is None else here - psnr

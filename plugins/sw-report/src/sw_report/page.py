@@ -16,7 +16,7 @@ from urllib.parse import quote
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 
-from splatwizard_core.tooling import as_installed, write_atomic
+from splatwizard_core.tooling import as_installed, several, write_atomic
 from sw_report import numbers, plots
 from sw_report import results_tables as tables
 from sw_report.aggregate import dataset_tables
@@ -189,20 +189,16 @@ def _lede(runs: Sequence[Run]) -> str:
         protocols = _unique([r.facts.protocol.id for r in runs])
         sizes = sorted(r.size for r in runs)
         return (
-            f"{made} runs: {_plural(len(methods), 'method')} on {_plural(len(scenes), 'scene')}, under "
-            f"{_plural(len(protocols), 'protocol')}. Files of {numbers.megabytes(sizes[0])} to "
+            f"{made} runs: {several(len(methods), 'method')} on {several(len(scenes), 'scene')}, under "
+            f"{several(len(protocols), 'protocol')}. Files of {numbers.megabytes(sizes[0])} to "
             f"{numbers.megabytes(sizes[-1])} MB; every score is of a model that was decoded from its file."
         )
     stored = numbers.counts(facts.counts) + (" Gaussians" if list(facts.counts) == ["num_gaussians"] else "")
     views = facts.test_views or len(facts.views)
     psnr = runs[0].mean("psnr")
-    reached = f" that reach {psnr:.2f} dB on {_plural(views, 'test view')}" if psnr is not None else ""
+    reached = f" that reach {psnr:.2f} dB on {several(views, 'test view')}" if psnr is not None else ""
     form = f" in {facts.uncompressed()}, not compressed," if facts.uncompressed() else ""
     return f"{numbers.megabytes(facts.file.bytes)} MB hold {stored}{form}{reached}; every score is of the decoded file."
-
-
-def _plural(n: int, word: str) -> str:
-    return f"{n} {word}" if n == 1 else f"{n} {word}s"
 
 
 def _key_figures(run: Run) -> list[dict[str, str]]:

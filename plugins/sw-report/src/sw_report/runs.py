@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from splatwizard_core.api import UserInputError
-from splatwizard_core.tooling import FILE_NAME
+from splatwizard_core.tooling import FILE_NAME, several
 from sw_report.configurations import PRESET, configurations, described, differing, seed_of
 from sw_report.declared import method_title, rate_position
 from sw_report.facts import RunFacts, clean, read_facts
@@ -190,8 +190,8 @@ def _tell_configurations_apart(runs: list[Run]) -> tuple[list[Run], list[str]]:
         if len({each.get(PRESET) for each in distinct}) == len(distinct):
             names = [preset or "no preset" for preset in presets]
         elif len(keys) <= MOST_KEYS:
-            several = len(set(presets)) > 1
-            names = [", ".join(filter(None, (preset if several else "", described(each, keys))))
+            mixed = len(set(presets)) > 1
+            names = [", ".join(filter(None, (preset if mixed else "", described(each, keys))))
                      for preset, each in zip(presets, found, strict=True)]  # fmt: skip
         else:
             names = [f"configuration {distinct.index(each) + 1}" for each in found]
@@ -279,5 +279,5 @@ def machine(facts: RunFacts) -> str:
     threads = environment.get("threads")
     parts = [str(environment.get("device", "unknown device")), str(name or "unknown processor")]
     if not isinstance(gpu, dict) and isinstance(threads, int):
-        parts.append(f"{threads} thread" + "s" * (threads != 1))
+        parts.append(several(threads, "thread"))
     return clean(", ".join(parts))

@@ -219,3 +219,8 @@ def duration(seconds: float) -> str:
 def counted(counts: Mapping[str, int]) -> str:
     """`120,331 gaussians`, of all that a model counts."""
     return ", ".join(f"{n:,} {name.removeprefix('num_')}" for name, n in counts.items())
+
+
+def several(count: int, noun: str) -> str:
+    """`1 view`, `1,200 views`."""
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from splatwizard_core.base.progress import counted
+from splatwizard_core.base.progress import counted, several
 from splatwizard_core.cli import options as shared
 from splatwizard_core.cli.paths import EXISTING, INPUT_FILE, OUTPUT_FILE, existing, output_file
 from splatwizard_core.cli.setup import Choices, open_session, takes_choices
@@ -93,7 +93,6 @@ def decode(
     if out is not None:
         save_decoded(model, facts, out, plugins)
     printed = facts.model_dump(mode="json") | ({} if out is None else {"out": str(out)})
-    many = "1 packet" if facts.packets == 1 else f"{facts.packets} packets"
-    part = f"{many}, {facts.bytes:,} bytes, " if facts.packets else ""
+    part = f"{several(facts.packets, 'packet')}, {facts.bytes:,} bytes, " if facts.packets else ""
     told = f"{part}{counted(facts.counts)}, decoded in {facts.decode_s:.3f} s on {facts.device}"
     shared.print_facts(printed, as_json, f"{facts.method}: {told}\nmodel digest {facts.digest}")

@@ -6,6 +6,7 @@ import os
 
 import torch
 
+from splatwizard_core.base.progress import several
 from splatwizard_core.errors import CapabilityError
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.rendering.info import RasterizerInfo
@@ -36,8 +37,7 @@ def device_reason(asked: str, chosen: torch.device, plugins: PluginManager) -> s
         why = "torch sees no CUDA device"
     else:
         why = f"no rasterizer can run on {torch.cuda.get_device_name()}; `sw doctor` says why"
-    threads = torch.get_num_threads()
-    return f"computing on cpu, {threads} thread{'s' if threads > 1 else ''} ({why})"
+    return f"computing on cpu, {several(torch.get_num_threads(), 'thread')} ({why})"
 
 
 def cuda_rasterizers(plugins: PluginManager) -> list[str]:
