@@ -15,7 +15,8 @@ from splatwizard_core.base.values import parse_text
 from splatwizard_core.errors import ConfigError, PluginError
 from splatwizard_core.method import Method, create_method
 from splatwizard_core.plugins.registry import Registry
-from splatwizard_core.runs.config import apply_overrides, parse_set, rate_points, resolve
+from splatwizard_core.runs.config import parse_set, rate_points, resolve
+from splatwizard_core.training.overrides import apply_overrides
 from splatwizard_core.training.params import OptimizationParams, Params
 
 

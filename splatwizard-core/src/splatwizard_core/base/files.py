@@ -136,12 +136,12 @@ def bytes_with_named(path: Path) -> int:
 
 
 @contextlib.contextmanager
-def scratch_folder(purpose: str, within: Path | None = None) -> Iterator[Path]:
-    """An empty folder in `within` (None: among the system's temporary files), removed when the block ends.
+def scratch_folder(purpose: str) -> Iterator[Path]:
+    """An empty folder among the system's temporary files, removed when the block ends.
 
     Those of the same purpose that killed processes left are removed too.
     """
-    folder = _temporary((within or Path(tempfile.gettempdir())) / f"splatwizard-{purpose}")
+    folder = _temporary(Path(tempfile.gettempdir()) / f"splatwizard-{purpose}")
     with naming_full_disk(folder):
         folder.mkdir(mode=0o700)
         try:

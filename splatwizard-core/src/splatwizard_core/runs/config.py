@@ -29,8 +29,6 @@ from splatwizard_core.training.params import OptimizationParams, Params, Pipelin
 if TYPE_CHECKING:
     from splatwizard_core.method import Method
 
-__all__ = ["ResolvedConfig", "apply_overrides", "parse_set", "rate_points", "read_config_file", "resolve"]
-
 RESERVED = ("method", "preset", "rate", "scene")
 SCENE_KEYS = tuple(SceneParams.model_fields)
 PRETRAINED = "pretrained."  # keys of the method whose trained scene a run starts from

@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 from splatwizard_core.errors import ConfigError, SplatwizardError, UserInputError, no_file
-from splatwizard_core.gaussians.invalid_rows import leave_out_senseless
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.method import Method
 from splatwizard_core.plugins import PluginManager, load_plugins
 from splatwizard_core.runs.config import INIT, ResolvedConfig, resolve
+from splatwizard_core.runs.decode import read_gaussians
 from splatwizard_core.training.added_tasks import add_tasks
 from splatwizard_core.training.keys import field_at, input_files, is_beside_method, value_at
 from splatwizard_core.training.overrides import apply_overrides
@@ -173,7 +173,7 @@ def check_model(path: str) -> GaussianModel:
         if file.read(4) == b"SPWZ":
             raise UserInputError(f"init: {path} is an encoded file: `sw export {path} FILE.ply` makes a .ply of it")
     try:
-        model = leave_out_senseless(load_plugins().read_gaussians(where), where.name)
+        model = read_gaussians(where, load_plugins())
     except SplatwizardError as error:
         reason = str(error).removeprefix(f"{where}: ").removeprefix(f"{where.name}: ")
         raise UserInputError(f"init: {path}: {reason}") from None

@@ -38,8 +38,6 @@ from splatwizard_core.training.state import TrainingState
 from splatwizard_core.training.timing import StageClock
 from splatwizard_core.training.trainer import Trainer
 
-__all__ = ["TrainOutcome", "TrainingRun", "TrainingStopped"]
-
 log = logging.getLogger(__name__)
 
 

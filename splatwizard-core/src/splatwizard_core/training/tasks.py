@@ -6,12 +6,13 @@ import functools
 import inspect
 import types
 import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, TypeVar, Union
+from typing import Any, TypeVar
 
 from torch import nn
 
+from splatwizard_core.base.values import members
 from splatwizard_core.errors import TaskSignatureError
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.rendering.rasterizer import Rasterizer, RenderResult
@@ -177,19 +178,15 @@ def _classes(p: inspect.Parameter, name: str, namespace: dict[str, Any]) -> tupl
                 f"task '{name}': annotation {annotation!r} of parameter '{p.name}' is not a type ({error})"
             ) from error
 
-    def members(annotation: Any) -> tuple[Any, ...]:
-        inner: Sequence[Any]
-        if typing.get_origin(annotation) is Annotated:
-            inner = typing.get_args(annotation)[:1]
-        elif isinstance(annotation, TypeVar):
-            inner = [resolve(a) for a in annotation.__constraints__ or (annotation.__bound__,)]
-        elif typing.get_origin(annotation) in (Union, types.UnionType):
-            inner = typing.get_args(annotation)
-        else:
-            return (annotation,)
-        return tuple(c for a in inner for c in members(a))
+    def allowed(annotation: Any) -> Iterator[Any]:
+        for member in members(annotation):
+            if isinstance(member, TypeVar):
+                for bound in member.__constraints__ or (member.__bound__,):
+                    yield from allowed(resolve(bound))
+            else:
+                yield member
 
-    return () if p.annotation is p.empty else members(resolve(p.annotation))
+    return () if p.annotation is p.empty else tuple(allowed(resolve(p.annotation)))
 
 
 def _field_of(classes: Sequence[Any]) -> str | None:
