@@ -109,5 +109,4 @@ from splatwizard_core.training.params import SceneParams as SceneParams
 from splatwizard_core.training.pipeline import TrainingRun as TrainingRun
 from splatwizard_core.training.pipeline import TrainingStopped as TrainingStopped
 from splatwizard_core.training.scheduler import build_schedulers as build_schedulers
-from splatwizard_core.training.state import TrainingState as TrainingState
 from splatwizard_native.errors import ForeseenError as ForeseenError
