@@ -12,7 +12,7 @@ from sw_reference.testing.raster_scenes import RasterCase, draw_scene, margin_sc
 from splatwizard_core.api import CapabilityError, RasterOptions
 
 REFERENCE = ReferenceRasterizer()
-CASE = RasterCase("fisher", n=3, width=9, height=8, spread=0.5, scale=(0.3, 0.6))
+CASE = RasterCase("fisher", n=3, width=6, height=5, spread=0.5, scale=(0.3, 0.6))
 STEP = 1e-5
 
 
@@ -64,7 +64,7 @@ def test_gathered_scales_have_the_blocks_of_dense_ones():
 def test_blocks_add_up_over_views_and_touch_no_gradient():
     g, cam = draw_scene(CASE, 2)
     g.means.requires_grad_()
-    second = cam.resized(7, 5)
+    second = cam.resized(4, 3)
     opt = RasterOptions(fisher=True)
     total = REFERENCE.accumulate(g, [cam, second], opt)
     assert total.scores == {}

@@ -100,9 +100,10 @@ def _probe(x: Tensor, seed: int) -> Tensor:
 
 
 def check_gradients(rasterizer: Rasterizer, case: RasterCase, seed: int = 1) -> None:
-    """`torch.autograd.gradcheck` in float64 of two random projections of each output, for every input tensor.
+    """`torch.autograd.gradcheck` in float64 of a random projection of each output, for every input tensor.
 
-    The scene keeps a margin to every threshold, so central differences see a smooth function.
+    Along a random direction of each tensor, which no wrong entry of a gradient is orthogonal to. The scene keeps a
+    margin to every threshold, so central differences see a smooth function.
     """
     g, cam = margin_scene(case, seed)
     options = _options(case, rasterizer.info, cam, torch.float64)
@@ -110,9 +111,12 @@ def check_gradients(rasterizer: Rasterizer, case: RasterCase, seed: int = 1) -> 
 
     def function(*values: Tensor) -> tuple[Tensor, ...]:
         result = rasterizer.render(with_tensors(g, dict(zip(leaves, values, strict=True))), cam, options)
-        return tuple((x * _probe(x, s)).sum() for x in outputs(result).values() for s in (1, 2))
+        return tuple((x * _probe(x, 1)).sum() for x in outputs(result).values())
 
-    assert torch.autograd.gradcheck(function, tuple(leaves.values()), eps=1e-6, atol=1e-6, rtol=1e-4)
+    limits = {"eps": 1e-6, "atol": 1e-6, "rtol": 1e-4}
+    assert torch.autograd.gradcheck(
+        function, tuple(leaves.values()), **limits, fast_mode=True, check_undefined_grad=False
+    )
 
 
 def run(

@@ -167,7 +167,7 @@ def removal_is_what_the_squared_error_changes_by(r: Rasterizer, device: str) -> 
 @check("FISHER")
 def fisher_blocks_equal_their_definition(r: Rasterizer, device: str) -> None:
     """Autograd through the definitions of the image, for each pixel and channel: all three ways of a mean."""
-    case = RasterCase("fisher", n=4, width=17, height=5, spread=0.6, scale=(0.2, 0.6), opacity=(0.5, 0.95))
+    case = RasterCase("fisher", n=4, width=17, height=2, spread=0.6, scale=(0.2, 0.6), opacity=(0.5, 0.95))
     g, cam = margin_scene(case, 5)
     background = torch.tensor([0.2, 0.7, 0.4], dtype=torch.float64)
     expected = view_fisher(lambda inputs: naive_render(inputs, cam, RasterOptions(background=background)).image, g)
