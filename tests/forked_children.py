@@ -294,6 +294,9 @@ class Imported:
                 importlib.import_module(name)
         if "sw_report.page" in sys.modules:
             sys.modules["sw_report.page"].page_template()  # compiling it is a quarter of a short run
+        if "sw_datasets.demo.synthetic" in sys.modules:
+            demo = sys.modules["sw_datasets.demo.synthetic"]
+            demo.make_scene(demo.SIZES["tiny"])  # most runs are of it
         with contextlib.suppress(Exception):  # a child looks itself; read metadata and parsed requirements are kept
             PluginManager(loading.installed_entry_points("splatwizard"))
         loading._installed_version.cache_clear()

@@ -67,11 +67,6 @@ def test_equal_calls_give_equal_bytes(source, small):
     assert again.data == small.out.read_bytes()
 
 
-def test_a_small_file_is_met_too(source):
-    done = compress(source, size=4_000, views=6, device="cpu")
-    assert 0.99 * 4_000 < len(done.data) == done.record["bytes"] <= 4_000
-
-
 def test_a_larger_size_is_a_better_picture(source, small):
     large = compress(source, size="12kB", views=6, device="cpu")
     assert large.record["quality"]["psnr"] > small.record["quality"]["psnr"]
@@ -83,7 +78,7 @@ def test_a_quality_is_reached_and_little_exceeded(source, quality: float):
     assert quality <= done.record["quality"]["psnr"] <= quality + 0.2
 
 
-@pytest.mark.parametrize(("count", "size"), [(30, 2_000), (150, 1_500), (400, 2_000)])
+@pytest.mark.parametrize(("count", "size"), [(30, 2_000), (400, 2_000)])
 def test_the_size_of_a_tiny_scene_is_met_too(ball, count: int, size: int):
     done = compress(ball(count), size=size, views=6, device="cpu")
     assert 0.99 * size < done.record["bytes"] <= size
@@ -121,15 +116,9 @@ def test_a_size_out_of_reach_names_one_that_works(source, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("stage", "stop"),
-    [
-        ("sensitivities", KeyboardInterrupt()),
-        ("encode", KeyboardInterrupt()),
-        ("encode", FULL_DISK),
-        ("decode", FULL_DISK),
-    ],
+    ("stage", "stop"), [("sensitivities", KeyboardInterrupt()), ("encode", FULL_DISK), ("decode", KeyboardInterrupt())]
 )
-def test_an_interruption_and_a_full_disk_leave_nothing(source, tmp_path, monkeypatch, stage: str, stop: BaseException):
+def test_an_interruption_and_a_full_disk_leave_nothing(ball, tmp_path, monkeypatch, stage: str, stop: BaseException):
     out, timed = tmp_path / "a.swz", Stages.timed
     out.write_bytes(b"an older file")
 
@@ -143,7 +132,7 @@ def test_an_interruption_and_a_full_disk_leave_nothing(source, tmp_path, monkeyp
     monkeypatch.setattr(Stages, "timed", stopped)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     with pytest.raises((KeyboardInterrupt, ForeseenError)):
-        compress(source, size="5kB", views=6, device="cpu", out=out, drop_unseen=True)
+        compress(ball(60), size="2kB", views=6, device="cpu", out=out, drop_unseen=True)
     assert [path.name for path in tmp_path.iterdir()] == ["a.swz"]
     assert out.read_bytes() == b"an older file"
 

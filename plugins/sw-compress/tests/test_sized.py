@@ -85,7 +85,7 @@ def test_without_a_size_it_is_the_codec_that_it_writes_with(model):
     assert decoded.num_rows >= 295  # but for what is never drawn
 
 
-def test_a_size_out_of_reach_is_told(model, tmp_path: Path):
+def test_a_size_out_of_reach_is_told(ball, tmp_path: Path):
     with pytest.raises(UserInputError, match="no file of 300 bytes was found: the smallest has"):
-        encode(sized("3dgs", "300"), model, {}, tmp_path / "a.swz")
+        encode(sized("3dgs", "300"), ball(30), {}, tmp_path / "a.swz")
     assert list(tmp_path.iterdir()) == []

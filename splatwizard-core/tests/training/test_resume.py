@@ -27,34 +27,34 @@ def trained_once():
 
 @pytest.fixture
 def whole(toy, trained_once):
-    """200 steps in one go."""
-    outcome = trained_once.get("outcome") or trained_once.setdefault("outcome", toy.train(iterations=200))
+    """100 steps in one go."""
+    outcome = trained_once.get("outcome") or trained_once.setdefault("outcome", toy.train(iterations=100))
     assert outcome.model.num_rows != 40  # densification did something,
     assert outcome.model.phase == "noisy"  # the mode changed,
     assert outcome.model.active_sh_degree == 1  # and so did the degree
     return outcome
 
 
-@pytest.mark.parametrize("stop", [44, 45, 199])
+@pytest.mark.parametrize("stop", [44, 45, 99])
 def test_stopped_and_resumed_equals_one_go(toy, whole, tmp_path, stop):
     with pytest.raises(TrainingStopped):
-        toy.train(iterations=200, directory=tmp_path, stop_after=stop)
-    resumed = toy.train(iterations=200, directory=tmp_path)
+        toy.train(iterations=100, directory=tmp_path, stop_after=stop)
+    resumed = toy.train(iterations=100, directory=tmp_path)
     assert resumed.model.digest() == whole.model.digest()
-    assert resumed.figures.steps == 200
+    assert resumed.figures.steps == 100
 
 
 def test_many_stops_equal_one_go(toy, whole, tmp_path):
-    for stop in range(30, 200, 30):
+    for stop in range(30, 100, 30):
         with pytest.raises(TrainingStopped):
-            toy.train(iterations=200, directory=tmp_path, stop_after=stop)
-    assert toy.train(iterations=200, directory=tmp_path).model.digest() == whole.model.digest()
+            toy.train(iterations=100, directory=tmp_path, stop_after=stop)
+    assert toy.train(iterations=100, directory=tmp_path).model.digest() == whole.model.digest()
 
 
 def test_a_second_run_equals_the_first_and_another_seed_does_not(toy, whole):
     torch.manual_seed(99)
-    assert toy.train(iterations=200).model.digest() == whole.model.digest()
-    other = toy.train(iterations=200, ppl=PipelineParams(seed=1))
+    assert toy.train(iterations=100).model.digest() == whole.model.digest()
+    other = toy.train(iterations=100, ppl=PipelineParams(seed=1))
     assert other.model.digest() != whole.model.digest()
 
 
@@ -82,9 +82,9 @@ def test_evaluation_changes_nothing(toy, whole, tmp_path):
         random.random(), np.random.rand(), torch.rand(5)
         return {"psnr": float(step)}
 
-    ppl = PipelineParams(eval_every=50, checkpoint_every=30)
-    outcome = toy.train(iterations=200, evaluate=evaluate, ppl=ppl, directory=tmp_path)
-    assert seen == [50, 100, 150, 200]
+    ppl = PipelineParams(eval_every=25, checkpoint_every=15)
+    outcome = toy.train(iterations=100, evaluate=evaluate, ppl=ppl, directory=tmp_path)
+    assert seen == [25, 50, 75, 100]
     assert outcome.model.training
     assert outcome.model.digest() == whole.model.digest()
     lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
@@ -109,47 +109,47 @@ def test_a_killed_run_goes_on_from_its_last_checkpoint(toy, whole, tmp_path):
         pass
 
     def kill(_, record):
-        if record.step == 137:
+        if record.step == 77:
             raise Killed
 
     ppl = PipelineParams(checkpoint_every=50)
     with pytest.raises(Killed):
-        toy.train(iterations=200, directory=tmp_path, ppl=ppl, on_step=kill)
+        toy.train(iterations=100, directory=tmp_path, ppl=ppl, on_step=kill)
     steps = []
-    resumed = toy.train(iterations=200, directory=tmp_path, ppl=ppl, on_step=lambda _, r: steps.append(r.step))
-    assert steps == list(range(101, 201))
+    resumed = toy.train(iterations=100, directory=tmp_path, ppl=ppl, on_step=lambda _, r: steps.append(r.step))
+    assert steps == list(range(51, 101))
     assert resumed.model.digest() == whole.model.digest()
 
 
 def test_the_log_of_a_resumed_run_has_each_step_once(toy, tmp_path):
     def fail(_, record):
-        if record.step == 137:
+        if record.step == 77:
             raise RuntimeError
 
     ppl = PipelineParams(checkpoint_every=50)
     with pytest.raises(RuntimeError):
-        toy.train(iterations=200, directory=tmp_path / "a", ppl=ppl, on_step=fail)
-    toy.train(iterations=200, directory=tmp_path / "a", ppl=ppl)
-    toy.train(iterations=200, directory=tmp_path / "b", ppl=ppl)
+        toy.train(iterations=100, directory=tmp_path / "a", ppl=ppl, on_step=fail)
+    toy.train(iterations=100, directory=tmp_path / "a", ppl=ppl)
+    toy.train(iterations=100, directory=tmp_path / "b", ppl=ppl)
     assert (tmp_path / "a" / "log.jsonl").read_text() == (tmp_path / "b" / "log.jsonl").read_text()
 
 
 def test_ctrl_c_finishes_the_step_and_saves_it(toy, whole, tmp_path):
     class Interrupted(toy.Rasterizer):
         def render(self, g, cam, opt):
-            if len(self.backgrounds) == 120:  # in the middle of step 121
+            if len(self.backgrounds) == 60:  # in the middle of step 61
                 os.kill(os.getpid(), signal.SIGINT)
             return super().render(g, cam, opt)
 
     done = []
     steps = Interrupted()
     with pytest.raises(KeyboardInterrupt):
-        toy.train(iterations=200, directory=tmp_path, rasterizer=steps, on_step=lambda _, r: done.append(r.step))
-    assert done[-1] == 121
+        toy.train(iterations=100, directory=tmp_path, rasterizer=steps, on_step=lambda _, r: done.append(r.step))
+    assert done[-1] == 61
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     steps = []
-    resumed = toy.train(iterations=200, directory=tmp_path, on_step=lambda _, r: steps.append(r.step))
-    assert steps[0] == 122
+    resumed = toy.train(iterations=100, directory=tmp_path, on_step=lambda _, r: steps.append(r.step))
+    assert steps[0] == 62
     assert resumed.model.digest() == whole.model.digest()
 
 
@@ -159,9 +159,9 @@ def test_ctrl_c_between_steps_saves_too(toy, whole, tmp_path):
             os.kill(os.getpid(), signal.SIGINT)
 
     with pytest.raises(KeyboardInterrupt):
-        toy.train(iterations=200, directory=tmp_path, on_step=interrupt)
+        toy.train(iterations=100, directory=tmp_path, on_step=interrupt)
     steps = []
-    resumed = toy.train(iterations=200, directory=tmp_path, on_step=lambda _, r: steps.append(r.step))
+    resumed = toy.train(iterations=100, directory=tmp_path, on_step=lambda _, r: steps.append(r.step))
     assert steps[0] == 78
     assert resumed.model.digest() == whole.model.digest()
 
@@ -216,7 +216,7 @@ def test_a_second_ctrl_c_stops_at_once(toy, tmp_path):
 
     done = []
     with pytest.raises(KeyboardInterrupt):
-        toy.train(iterations=200, directory=tmp_path, rasterizer=Impatient(), on_step=lambda _, r: done.append(r.step))
+        toy.train(iterations=100, directory=tmp_path, rasterizer=Impatient(), on_step=lambda _, r: done.append(r.step))
     assert done[-1] == 20
     assert not list(tmp_path.glob("*.safetensors"))
 
@@ -243,24 +243,24 @@ def test_training_works_outside_the_main_thread(toy):
 
 
 def test_a_finished_run_is_only_loaded(toy, whole, tmp_path):
-    first = toy.train(iterations=200, directory=tmp_path)
+    first = toy.train(iterations=100, directory=tmp_path)
     steps = []
-    again = toy.train(iterations=200, directory=tmp_path, on_step=lambda _, r: steps.append(r.step))
+    again = toy.train(iterations=100, directory=tmp_path, on_step=lambda _, r: steps.append(r.step))
     assert steps == []
     assert again.model.digest() == first.model.digest() == whole.model.digest()
     assert again.figures == first.figures
     assert again.plan == first.plan
     with pytest.raises(TrainingStopped):
         # Stopping at the very end of the last stage is finishing; before, it is not.
-        toy.train(iterations=200, directory=tmp_path / "b", stop_after=199)
-    toy.train(iterations=200, directory=tmp_path / "b", stop_after=200)
+        toy.train(iterations=100, directory=tmp_path / "b", stop_after=99)
+    toy.train(iterations=100, directory=tmp_path / "b", stop_after=100)
 
 
 def test_without_resuming_a_run_starts_again(toy, whole, tmp_path):
     with pytest.raises(TrainingStopped):
-        toy.train(iterations=200, directory=tmp_path, stop_after=100)
+        toy.train(iterations=100, directory=tmp_path, stop_after=50)
     steps = []
-    outcome = toy.train(iterations=200, directory=tmp_path, resume=False, on_step=lambda _, r: steps.append(r.step))
+    outcome = toy.train(iterations=100, directory=tmp_path, resume=False, on_step=lambda _, r: steps.append(r.step))
     assert steps[0] == 1
     assert outcome.model.digest() == whole.model.digest()
     lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
@@ -269,10 +269,10 @@ def test_without_resuming_a_run_starts_again(toy, whole, tmp_path):
 
 def test_a_shorter_run_than_its_checkpoint_has_nothing_to_do(toy, tmp_path):
     with pytest.raises(TrainingStopped):
-        toy.train(iterations=200, directory=tmp_path, stop_after=100)
-    options = {"identity": {"method": "toy", "iterations": 100}, "allow_changed_plan": True}
-    with pytest.raises(NothingToDo, match="ends at step 100, and 100 steps are done"):
-        toy.train(iterations=100, directory=tmp_path, **options)
+        toy.train(iterations=100, directory=tmp_path, stop_after=50)
+    options = {"identity": {"method": "toy", "iterations": 50}, "allow_changed_plan": True}
+    with pytest.raises(NothingToDo, match="ends at step 50, and 50 steps are done"):
+        toy.train(iterations=50, directory=tmp_path, **options)
 
 
 def test_a_stage_may_have_no_steps_and_is_finished_at_once(toy, tmp_path):
@@ -288,22 +288,22 @@ def test_a_stage_may_have_no_steps_and_is_finished_at_once(toy, tmp_path):
 
 
 def test_a_finished_run_can_be_made_longer(toy, tmp_path):
-    toy.train(iterations=100, directory=tmp_path, identity={"iterations": 100})
+    toy.train(iterations=40, directory=tmp_path, identity={"iterations": 40})
     steps = []
     longer = toy.train(
-        iterations=150, directory=tmp_path, identity={"iterations": 150}, allow_changed_plan=True,
+        iterations=60, directory=tmp_path, identity={"iterations": 60}, allow_changed_plan=True,
         on_step=lambda _, r: steps.append(r.step),
     )  # fmt: skip
-    assert steps == list(range(101, 151))
-    assert longer.figures.steps == 150
+    assert steps == list(range(41, 61))
+    assert longer.figures.steps == 60
 
 
 def test_another_configuration_is_refused_and_named(toy, tmp_path, caplog):
     with pytest.raises(TrainingStopped):
-        toy.train(iterations=200, directory=tmp_path, stop_after=50, identity={"lr": {"means": 0.1}})
+        toy.train(iterations=60, directory=tmp_path, stop_after=50, identity={"lr": {"means": 0.1}})
     with pytest.raises(CheckpointError, match=r"lr\.means: 0\.1 -> 0\.2.*--allow-changed-plan"):
-        toy.train(iterations=200, directory=tmp_path, identity={"lr": {"means": 0.2}})
-    toy.train(iterations=200, directory=tmp_path, identity={"lr": {"means": 0.2}}, allow_changed_plan=True)
+        toy.train(iterations=60, directory=tmp_path, identity={"lr": {"means": 0.2}})
+    toy.train(iterations=60, directory=tmp_path, identity={"lr": {"means": 0.2}}, allow_changed_plan=True)
     assert "lr.means: 0.1 -> 0.2" in caplog.text
 
 
@@ -353,18 +353,18 @@ def test_state_that_does_not_fit_the_model_is_a_checkpoint_error(toy, tmp_path):
 
 
 def test_a_damaged_checkpoint_costs_only_the_steps_since_the_one_before(toy, whole, tmp_path, caplog):
-    ppl = PipelineParams(checkpoint_every=40, keep_checkpoints=2)
+    ppl = PipelineParams(checkpoint_every=20, keep_checkpoints=2)
     with pytest.raises(TrainingStopped):
-        toy.train(iterations=200, directory=tmp_path, ppl=ppl, stop_after=120)
-    newest = tmp_path / "00-0000120.safetensors"
+        toy.train(iterations=100, directory=tmp_path, ppl=ppl, stop_after=60)
+    newest = tmp_path / "00-0000060.safetensors"
     data = bytearray(newest.read_bytes())
     data[-5] ^= 1
     newest.write_bytes(data)
     steps = []
-    resumed = toy.train(iterations=200, directory=tmp_path, ppl=ppl, on_step=lambda _, r: steps.append(r.step))
-    assert steps[0] == 81
+    resumed = toy.train(iterations=100, directory=tmp_path, ppl=ppl, on_step=lambda _, r: steps.append(r.step))
+    assert steps[0] == 41
     assert resumed.model.digest() == whole.model.digest()
-    assert "resuming from 00-0000080.json instead" in caplog.text
+    assert "resuming from 00-0000040.json instead" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -410,7 +410,7 @@ def test_stop_by_a_task_finishes_the_stage_for_good(toy, tmp_path):
         def register_post_task(self, scheduler, ppl, opt):
             scheduler.register_task(33, lambda: STOP, name="enough")
 
-    stages = [Stopping(OptimizationParams(iterations=200))]
+    stages = [Stopping(OptimizationParams(iterations=100))]
     first = toy.train(stages, directory=tmp_path)
     assert first.figures.steps == 33
     steps = []

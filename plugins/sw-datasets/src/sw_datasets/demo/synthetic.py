@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -207,6 +208,17 @@ def start_points(world: World, cameras: list[Camera], count: int, generator: tor
     )
 
 
+@functools.lru_cache(maxsize=4)
+def _made(size: DemoSize, seed: int, init_seed: int) -> tuple[World, tuple[Tensor, ...]]:
+    """The world; surface samples and their normals; start points and their colours. Other rate points ask again."""
+    world, generator = build_world(seed), stream(init_seed, "demo-points")
+    xyz, normals, _ = sample_surfaces(world, size.surface, generator)
+    points = start_points(world, orbit(size.views, size.width, size.height), size.points, generator)
+    assert points.rgb is not None
+    surface = [torch.from_numpy(rows.T.astype(np.float32)) for rows in (xyz, normals)]
+    return world, (*surface, points.xyz, points.rgb)
+
+
 def _picture(world: World, seed: int, camera: Camera, samples: int, background: float) -> NDArray[np.uint8]:
     """Draw a camera's picture of `build_world(seed)`, or read it, if it was drawn before."""
     key = picture_key(stream(seed, "world").get_state().numpy().tobytes(), camera, samples, background)
@@ -235,7 +247,8 @@ def make_scene(
     points          as in the protocol: "train" draws start points that the training views see
     """
     size = size or DemoSize()
-    world = build_world(seed)
+    world, made = _made(size, seed, init_seed)
+    surface, normals, xyz, rgb = (rows.clone() for rows in made)
     cameras = orbit(size.views, size.width, size.height)
     grey = 1.0 if background == "white" else 0.0
     views = [
@@ -243,12 +256,10 @@ def make_scene(
         for i, camera in enumerate(cameras)
     ]
     width, height = source_size or (size.width, size.height)
-    generator = stream(init_seed, "demo-points")
-    xyz, normals, _ = sample_surfaces(world, size.surface, generator)
     return assemble_scene(
         name,
         views,
-        points=start_points(world, cameras, size.points, generator),
+        points=PointCloud(xyz, rgb),
         train_points=lambda train: start_points(
             world, [view.camera for view in train], size.points, stream(init_seed, "demo-points")
         ),
@@ -261,8 +272,8 @@ def make_scene(
             points=points,
         ),
         ground_truth={
-            "points": torch.from_numpy(xyz.T.astype(np.float32)),
-            "normals": torch.from_numpy(normals.T.astype(np.float32)),
+            "points": surface,
+            "normals": normals,
             "distance": world.distance,
             "depth": ExactMaps(world, views, depth_map),
             "normal_maps": ExactMaps(world, views, normal_map),
