@@ -36,7 +36,7 @@ CODECS = TESTS.parent / "plugins" / "sw-codecs"
 EXACT_TABLES = CODECS / "src" / "sw_codecs" / "data" / "exact_tables.bin"
 GOLDEN = sorted((TESTS / "golden").glob("*.swz"))
 WISP = [path for path in GOLDEN if path.stem.startswith("wisp")]
-RATES = ("r1", "r3", "r5", "r6")
+RATES = ("r1", "r6")
 
 
 def load(path: Path):

@@ -72,7 +72,10 @@ def collected() -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
     for folder in PACKAGES:
         for file in sorted((folder / "src").rglob("*.py")):
-            tree = ast.parse(file.read_text("utf-8"))
+            source = file.read_text("utf-8")
+            if "install" not in source:
+                continue
+            tree = ast.parse(source)
             for text in texts_of(tree, constants_of(tree)):
                 for match in COMMAND.finditer(text):
                     if " -e " in match[0]:  # of a folder that the message names

@@ -111,7 +111,7 @@ def test_a_binary_file_cut_at_any_byte_names_itself_and_the_offset(colmap_folder
 
 @pytest.mark.parametrize("suffix", ["bin", "txt"])
 @pytest.mark.parametrize("part", ["cameras", "images", "points3D"])
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(data=st.data())
 def test_flipped_bytes_are_read_or_refused_and_never_crash(part, suffix, data):
     with tempfile.TemporaryDirectory() as folder:

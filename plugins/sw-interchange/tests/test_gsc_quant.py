@@ -115,11 +115,11 @@ def test_what_would_be_clipped_takes_the_range_of_its_values_alone():
 
 
 def test_more_bits_make_larger_files():
-    model = model_of(1000)
-    rates = ((14, 6), (15, 7), (16, 8), (17, 10), (18, 12))
+    model = model_of(400)
+    rates = ((14, 6), (16, 8), (18, 12))
     sizes = [len(written(model, position_bits=position, bits=bits)) for position, bits in rates]
     assert sizes == sorted(sizes)
-    assert len(set(sizes)) == 5
+    assert len(set(sizes)) == 3
 
 
 def test_a_model_may_be_larger_than_what_any_file_may_stand_for(monkeypatch):

@@ -192,7 +192,7 @@ def test_parts_that_make_no_sense_are_refused(make):
             coder.decode(parts, n, d)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(st.data())
 def test_damage_is_refused_or_gives_finite_vectors(make, data):
     vectors, importance = clusters(60, d=3)

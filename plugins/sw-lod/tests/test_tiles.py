@@ -102,7 +102,7 @@ def test_a_scene_that_no_camera_sees_is_ordered_all_the_same(model):
     assert decoded(encoded(faint, rows=8)).num_rows == 30
 
 
-@pytest.mark.parametrize("count", [0, 1, 2])
+@pytest.mark.parametrize("count", [0, 1])
 def test_few_gaussians_come_back(model, count):
     few = GaussianModel(*(getattr(model, name).detach()[:count] for name in
                           ("means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats")))  # fmt: skip

@@ -26,8 +26,8 @@ from sw_rasterizers.standard import StandardRasterizer
 pytestmark = pytest.mark.skipif(MODULE.available() is not None, reason=str(MODULE.available()))
 MANY = RasterCase("many", n=1000, width=75, height=50, spread=2.0, scale=(0.01, 0.25), degree=3)
 """Fills 5 x 4 tiles, the last ones partial, with lists longer than a stage of the kernels."""
-FEW = RasterCase("few", n=6, width=18, height=4, spread=0.7, scale=(0.2, 0.6), opacity=(0.5, 0.98))
-"""Small enough for the oracle's Fisher blocks: a pass of autograd for each of 216 values."""
+FEW = RasterCase("few", n=6, width=18, height=2, spread=0.7, scale=(0.2, 0.6), opacity=(0.5, 0.98))
+"""Small enough for the oracle's Fisher blocks: a pass of autograd for each of 108 values."""
 ALL = [ScoreSpec(kind, kind) for kind in scoring.KINDS]
 TESTED = [
     ScoreSpec(f"{kind} tested", kind, rule="tested", gamma=0.3)

@@ -298,11 +298,11 @@ def test_registry_entry_declares_what_the_class_offers():
 def test_opacity_gradients_of_fragments_are_those_of_autograd_pixel_by_pixel():
     dtype = torch.float32
     g, camera = fragment_scene(dtype)
-    truth = torch.rand(3, 32, 32, generator=torch.Generator().manual_seed(2)).to(dtype)
+    truth = torch.rand(3, 16, 16, generator=torch.Generator().manual_seed(2)).to(dtype)
 
     def pixels(**asked: bool) -> tuple[torch.Tensor, RenderResult]:
         result = StandardRasterizer().render(g, camera.to(dtype=dtype), RasterOptions(**asked))
-        return (result.image - truth).square().mean(dim=0) / (32 * 32), result
+        return (result.image - truth).square().mean(dim=0) / (16 * 16), result
 
     parts, _ = pixels()
     expected = torch.zeros(len(g), 2, dtype=dtype)
@@ -319,7 +319,7 @@ def test_opacity_gradients_of_fragments_are_those_of_autograd_pixel_by_pixel():
 
 
 def fragment_scene(dtype: torch.dtype) -> tuple[GaussianInputs, Camera]:
-    """Twenty Gaussians in front of a camera of 32 x 32 pixels; opacities require a gradient."""
+    """Twenty Gaussians in front of a camera of 16 x 16 pixels; opacities require a gradient."""
     r = torch.Generator().manual_seed(1)
 
     def draw(*shape: int) -> torch.Tensor:
@@ -329,7 +329,7 @@ def fragment_scene(dtype: torch.dtype) -> tuple[GaussianInputs, Camera]:
     quats = torch.nn.functional.normalize(draw(20, 4) - 0.5, dim=1)
     opacities = (0.9 * draw(20) + 0.05).requires_grad_()
     g = GaussianInputs(means, opacities, 0.3 * draw(20, 3) + 0.05, quats, colors=draw(20, 3))
-    return g, Camera(32, 32, 40.0, 40.0, 16.0, 16.0, torch.eye(3), torch.zeros(3))
+    return g, Camera(16, 16, 20.0, 20.0, 8.0, 8.0, torch.eye(3), torch.zeros(3))
 
 
 def test_opacity_gradients_and_absolute_gradients_exclude_each_other():

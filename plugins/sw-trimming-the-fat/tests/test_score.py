@@ -43,7 +43,7 @@ NUMBERS = st.lists(st.integers(0, 40), min_size=1, max_size=60)
 LEVELS = st.one_of(st.floats(0, 1), st.sampled_from([0.0, 0.225, 0.3, 0.425, 0.5, 0.6, 1.0]))
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(values=NUMBERS, seed=st.integers(0, 2**31), level=LEVELS)
 def test_a_level_cuts_what_is_below_both_quantiles(values, seed, level):
     opacities = np.array(values, np.float64)

@@ -174,7 +174,7 @@ def test_a_later_wave_changes_nothing_before_it():
 
 def test_estimates_are_the_size_of_the_file():
     """Of integer tables within 0.5 %, of the floats of a training within 2 %."""
-    scene = made_up(20_000)
+    scene = made_up(10_000)
     net = ContextNetworks(adaptive=False)
     values = (scene.values / STEPS).float()
     net.measure_prior(values)
@@ -186,12 +186,12 @@ def test_estimates_are_the_size_of_the_file():
     counter = Counter()
     walk = Walk(net.exact(), file.fit_shares([state.cells]), 0, [state.cells], lambda r, c, _: state.index[r, c])
     for kind in ("base", "view"):
-        walk.packet(counter, Packet(0, kind, 20_000))
+        walk.packet(counter, Packet(0, kind, 10_000))
     sections = ContainerReader(data).sections
     assert counter.total == pytest.approx(8 * (sections["packet.01"] + sections["packet.02"]), rel=0.005)
     assert spent[10:].sum() == pytest.approx(8 * sections["packet.02"], rel=0.005)
 
-    units = torch.empty(20_000, NUMBERS, dtype=torch.float64)
+    units = torch.empty(10_000, NUMBERS, dtype=torch.float64)
     units[rows] = torch.from_numpy(state.units(np.arange(20_000), slice(None)) / UNIT)
     index = torch.empty_like(units)
     index[rows] = torch.from_numpy(state.index).double()
@@ -216,7 +216,7 @@ def plane(n: int, colour) -> file.Scene:
 
 def colour_bits(scene, updates=120) -> tuple[float, float]:
     """Bits of the colours with fitted networks, and the entropy of their columns."""
-    net = fitted_context(scene.levels, scene.cells, scene.values, STEPS, updates=updates, batch=512)
+    net = fitted_context(scene.levels, scene.cells, scene.values, STEPS, updates=updates, batch=256)
     data, encoded = written(replace(scene, context=net.exact()))
     state = encoded.decoded.state
     spent = bits_of(state)[:, COLOUR.columns].sum()
@@ -252,7 +252,7 @@ def test_a_splat_far_from_its_first_latents_expects_others_far():
     values = scene.values.clone()
     values[:, 10:] = 0.3 * strength * torch.randn(3000, 12, generator=draws, dtype=torch.float64)
     scene = replace(scene, values=values.clamp(-2.9, 2.9))
-    net = fitted_context(scene.levels, scene.cells, scene.values, STEPS, updates=150)
+    net = fitted_context(scene.levels, scene.cells, scene.values, STEPS, updates=150, batch=512)
     spent = bits_of(written(replace(scene, context=net.exact()))[1].decoded.state)[:, 10:].mean(0)
     assert spent[4:].mean() < spent[:4].mean() - 0.1
 

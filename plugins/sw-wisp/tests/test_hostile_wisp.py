@@ -73,10 +73,10 @@ def test_a_few_hundred_hostile_files(seeds, monkeypatch, decoder):
             monkeypatch.setattr(module, "EXACT", SimpleNamespace(try_load=lambda: False))
     elif not (CODECS.try_load() and EXACT.try_load()):
         pytest.skip("there are no compiled kernels")
-    tally = fuzz(seeds, 250, 1)
+    tally = fuzz(seeds, 120, 1)
     assert tally.problems == []
-    assert tally.outcomes["refused"] > 90
-    assert tally.outcomes["decoded"] > 12
+    assert tally.outcomes["refused"] > 40
+    assert tally.outcomes["decoded"] > 5
 
 
 @pytest.mark.parametrize("claim", [(0, 16, 1), (5, 4, 1), (0, 3, 2), (255, 255, 3)])

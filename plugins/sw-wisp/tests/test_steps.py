@@ -75,7 +75,7 @@ def test_bits_pull_at_a_step_as_they_fall_with_it():
 
 
 def test_networks_fitted_to_numbers_code_them_in_fewer_bits_and_take_the_steps_that_errors_are_worth():
-    scene = made_up(1_500, spread=1.0)
+    scene = made_up(600, spread=1.0)
     base = torch.tensor(scene.base_steps)
     rate = PyramidRate(0.5 * base, adaptive=True, generator=torch.Generator().manual_seed(0))
     splats = Placed(scene.values.float(), scene.levels, scene.cells)
@@ -96,6 +96,6 @@ def test_networks_fitted_to_numbers_code_them_in_fewer_bits_and_take_the_steps_t
     assert after < before - 3
     assert torch.equal(still, steps)
     # With Q far below the deviation, bits fall by 1 / ln 2 for each factor e of Q: least where w Q^2 / 6 is that.
-    weights = (6 / math.log(2) / (0.25 * base) ** 2).expand(1_500, NUMBERS)
+    weights = (6 / math.log(2) / (0.25 * base) ** 2).expand(600, NUMBERS)
     rate.fit(rows, splats.values, rounding, 300, weights)
     assert torch.allclose(found()[0].log().mean(0), torch.tensor(0.25).log(), atol=0.2)

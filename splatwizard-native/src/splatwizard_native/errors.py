@@ -15,7 +15,7 @@ def shortened(message: str) -> str:
         cut = f"{text[: most // 5]}... ({len(text):,} characters) ...{text[-most // 20 :]}"
         return text if len(text) <= most else cut
 
-    return ends(re.sub(rf"\S{{{MAX_WORD},}}", lambda word: ends(word[0], MAX_WORD), message), MAX_MESSAGE)
+    return ends(re.sub(rf"(?<!\S)\S{{{MAX_WORD},}}", lambda word: ends(word[0], MAX_WORD), message), MAX_MESSAGE)
 
 
 class ForeseenError(Exception):
