@@ -16,7 +16,9 @@ import numpy as np
 
 from splatwizard_core.api import BitstreamError
 from sw_codecs.entropy.exact_tables import LEVELS
-from sw_wisp.nested import UNIT, Stream, coarser, table_levels
+from sw_wisp.fast.forecasts import kept as fast_kept
+from sw_wisp.fast.forecasts import values as fast_values
+from sw_wisp.nested import THIRD_OF_SCALE, UNIT, Stream, coarser, table_levels
 from sw_wisp.numbers import BLOCKS, COLOUR, LATENTS, NUMBERS, OPACITY, PARTS, SHAPE
 from sw_wisp.octree import Cells, code_cells, joined
 from sw_wisp.octree_contexts import Shares
@@ -92,6 +94,9 @@ class State:
     def units(self, rows: np.ndarray, columns: slice) -> np.ndarray:
         """Known values int64 [n,c] in base steps with 12 fractional bits."""
         at = even(rows)
+        found = fast_values(at, columns, self.mean, self.index, self.multiplier)
+        if found is not None:
+            return found
         return self.mean[at, columns] + self.index[at, columns] * self.multiplier[at, columns].astype(np.int64)
 
 
@@ -107,8 +112,8 @@ class Context(Protocol):
     def predict(self, block: slice, rows: np.ndarray, state: State) -> Prediction:
         """Distributions of the columns `block` of splats `rows`, all blocks before it known."""
 
-    def moved(self, part: slice, rows: np.ndarray, state: State) -> tuple[np.ndarray, np.ndarray] | None:
-        """Additions of the parts of a block before it to the means and scales [n,c] of `part`; None: nothing."""
+    def moved(self, part: slice, rows: np.ndarray, state: State) -> np.ndarray | None:
+        """Additions [2,n,c] of the parts of a block before it to means and scales of `part`; None: nothing."""
 
     def changed(self, rows: np.ndarray, columns: slice, before: np.ndarray | None, state: State) -> None:
         """Take note that `columns` of splats became known, or finer than `before` [n,c]."""
@@ -159,7 +164,8 @@ class Walk:
         """Predict latents that no packet holds, from all that is known: they stand at their means."""
         rows = np.flatnonzero(~self.state.has_view)
         if len(rows):
-            self._keep(LATENTS.columns, rows, self._context.predict(LATENTS.columns, rows, self.state))
+            found = self._context.predict(LATENTS.columns, rows, self.state)
+            kept(found, 0, None, LATENTS.columns, rows, self.state, 0)
 
     def _base(self, stream: Stream, packet: Packet) -> None:
         state, number = self.state, len(self._rows)
@@ -178,27 +184,16 @@ class Walk:
             return
         found = self._context.predict(block, rows, self.state)
         for part in PARTS[BLOCKS.index(block)]:
-            own = found.part(slice(part.start - block.start, part.stop - block.start))
             more = self._context.moved(part, rows, self.state)
-            if more is not None:
-                own = Prediction(own.mean + more[0], own.scale + more[1], own.multiplier)
-            self._keep(part, rows, own)
-            self._code(stream, part, rows, planes)
+            tables = kept(found, part.start - block.start, more, part, rows, self.state, planes)
+            self._code(stream, part, rows, tables, planes)
 
-    def _keep(self, columns: slice, rows: np.ndarray, found: Prediction) -> None:
-        at = even(rows)
-        self.state.mean[at, columns] = np.clip(found.mean, -VALUE_LIMIT, VALUE_LIMIT)
-        self.state.scale[at, columns] = np.clip(found.scale, 0, HIGHEST_SCALE)
-        self.state.multiplier[at, columns] = found.multiplier
-
-    def _code(self, stream: Stream, part: slice, rows: np.ndarray, planes: int) -> None:
+    def _code(self, stream: Stream, part: slice, rows: np.ndarray, tables: np.ndarray, planes: int) -> None:
         if self._choose is not None:
             known = (getattr(self.state, name)[rows, part].astype(np.int64) for name in PARAMETERS)
             self._chosen[rows, part] = self._choose(rows, part, Prediction(*known))
         wanted = self._coarse(rows, part, planes)
-        at = even(rows)
-        tables = table_levels(self.state.scale[at, part], planes)
-        self.state.index[at, part] = stream.indices(tables, wanted) * 3**planes
+        self.state.index[even(rows), part] = stream.indices(tables, wanted) * 3**planes
 
     def _coarse(self, rows: np.ndarray, columns: slice, planes: int) -> np.ndarray | None:
         """Indices that an encoder writes, coarser `planes` times."""
@@ -232,6 +227,27 @@ class Walk:
         """Parts of the rows of one subset."""
         is_first = len(rows) > 0 and rows[0] == 0
         return waves(rows, self._context.waves[not is_first])
+
+
+def kept(
+    found: Prediction, begin: int, moved: np.ndarray | None, columns: slice, rows: np.ndarray, state: State, planes: int
+) -> np.ndarray:
+    """Keep in `state` what predicts `columns` of splats `rows`; return the tables uint8 [n,c] that code them.
+
+    found   of a block whose column `begin` is the first of them
+    moved   [2,n,c] additions to means and scale levels; None: nothing
+    planes  how often their step is tripled
+    """
+    at = even(rows)
+    tables = fast_kept(found, begin, moved, columns, at, state, planes * THIRD_OF_SCALE)
+    if tables is not None:
+        return tables
+    own = found.part(slice(begin, begin + columns.stop - columns.start))
+    mean, scale = (own.mean, own.scale) if moved is None else (own.mean + moved[0], own.scale + moved[1])
+    state.mean[at, columns] = np.clip(mean, -VALUE_LIMIT, VALUE_LIMIT)
+    state.scale[at, columns] = np.clip(scale, 0, HIGHEST_SCALE)
+    state.multiplier[at, columns] = own.multiplier
+    return table_levels(state.scale[at, columns], planes)
 
 
 def even(rows: np.ndarray) -> slice | np.ndarray:

@@ -15,8 +15,9 @@ import torch
 from splatwizard_core.api import BitstreamError
 from sw_codecs.bits.packing import ByteReader
 from sw_codecs.context.integer_mlp import IntegerMlp
-from sw_codecs.entropy.exact_tables import step_multipliers
+from sw_codecs.entropy.exact_tables import exact_tables, step_multipliers
 from sw_wisp.eight_bits import EXACT_EXPONENT, EightBitLayer, pack_layers, unpack_layers
+from sw_wisp.fast.forecasts import forecasts
 from sw_wisp.fast.running_means import pyramid_of
 from sw_wisp.nested import UNIT
 from sw_wisp.numbers import BLOCKS, LATENTS, NUMBERS
@@ -79,15 +80,20 @@ class PyramidContext:
         if number == 0 or block == VIEW:
             self._features = self._pyramid.features(torch.from_numpy(rows))  # B and C follow A with the same rows
         further = torch.from_numpy(state.units(rows, slice(0, block.start))) if number else None
-        out = self._networks[number](self._features, further).numpy()
-        mean = self._features[:, block].numpy() + out[:, :width]
+        out = self._networks[number](self._features, further)
+        table = exact_tables().multipliers if self.adaptive else None
+        found = forecasts(self._features, out, block.start, STEPS_OF[number], table)
+        if found is not None:
+            return Prediction(*found)
+        given = out.numpy()
+        mean = self._features[:, block].numpy() + given[:, :width]
         multiplier = np.full(mean.shape, UNIT)
         if self.adaptive:
-            multiplier = step_multipliers(out[:, 2 * width :])[:, STEPS_OF[number]]
-        return Prediction(mean, out[:, width : 2 * width], multiplier)
+            multiplier = step_multipliers(given[:, 2 * width :])[:, STEPS_OF[number]]
+        return Prediction(mean, given[:, width : 2 * width], multiplier)
 
-    def moved(self, part: slice, rows: np.ndarray, state: State) -> tuple[np.ndarray, np.ndarray] | None:
-        """Additions to the means and scales of a part, for those before it in its block."""
+    def moved(self, part: slice, rows: np.ndarray, state: State) -> np.ndarray | None:
+        """Additions [2,n,c] to the means and scales of a part, for those before it in its block."""
         for tie, (tied, before) in zip(self.ties, tied_parts(), strict=True):
             if tied == part:
                 return moved(tie, before, rows, state)

@@ -39,8 +39,8 @@ def tie_shapes() -> list[tuple[int, int]]:
     return [(2 * (part.stop - part.start), before.stop - before.start) for part, before in tied_parts()]
 
 
-def moved(tie: EightBitLayer, before: slice, rows: np.ndarray, state: State) -> tuple[np.ndarray, np.ndarray]:
-    """Additions to the means and scale levels of a part of splats `rows`, int64 [n,c], 12 fractional bits.
+def moved(tie: EightBitLayer, before: slice, rows: np.ndarray, state: State) -> np.ndarray:
+    """Additions to the means, then the scale levels, of a part of splats `rows`, int64 [2,n,c], 12 fractional bits.
 
     before  columns in its block that are known
     """
@@ -55,8 +55,7 @@ def moved(tie: EightBitLayer, before: slice, rows: np.ndarray, state: State) -> 
     weights = np.ldexp(tie.weights.astype(np.float64), tie.exponents[:, None].astype(np.int64))
     half = len(weights) // 2
     parts = (residuals @ weights[:half].T, sizes @ weights[half:].T)  # multiples of 2^-12 below 2^53: exact
-    mean, scale = (np.floor(part).astype(np.int64) for part in parts)
-    return mean, scale
+    return np.floor(np.stack(parts)).astype(np.int64)
 
 
 def pack_ties(ties: Sequence[EightBitLayer]) -> bytes:

@@ -12,13 +12,13 @@ from wisp_scenes import made_up
 from splatwizard_core.api import BitstreamError, ContainerReader, ContainerWriter
 from sw_codecs.exact_native import EXACT as CODECS
 from sw_codecs.fast import exact_face as codecs_face
-from sw_wisp import file, nested, octree
-from sw_wisp.fast import exact_face, running_means, streams, ties
+from sw_wisp import file, nested, octree, packets
+from sw_wisp.fast import exact_face, forecasts, running_means, streams, ties
 from sw_wisp.fast.exact_native import EXACT
 from sw_wisp.fast.running_means import pyramid_of
 from sw_wisp.fast.streams import FastReader
 from sw_wisp.nested import Reader, Writer
-from sw_wisp.numbers import PARTS
+from sw_wisp.numbers import BLOCKS, PARTS
 from sw_wisp.octree_contexts import Shares
 from sw_wisp.pyramid import BASE, REFINED, VIEW
 
@@ -40,7 +40,7 @@ def plain(monkeypatch):
 
     def call(work):
         with monkeypatch.context() as patch:
-            for module in (streams, running_means, ties):
+            for module in (streams, running_means, ties, forecasts):
                 patch.setattr(module, "EXACT", SimpleNamespace(try_load=lambda: False))
             return work()
 
@@ -175,6 +175,41 @@ def test_ties_add_the_same_integers(plain, rows):
             assert one.any()
 
 
+@pytest.mark.parametrize("planes", [0, 2])
+@pytest.mark.parametrize("rows", [slice(1, 400, 3), slice(7, 8)])
+def test_forecasts_are_kept_as_the_same_integers(plain, rows, planes):
+    rng, at, columns = np.random.default_rng(5), np.arange(400)[rows], slice(2, 6)
+    features = torch.from_numpy(rng.integers(-(1 << 20), 1 << 20, (len(at), 69)))
+    outputs = torch.from_numpy(rng.integers(-(1 << 21), 1 << 21, (len(at), 14)))
+    outputs[::2] >>= 5
+    more = rng.integers(-(1 << 18), 1 << 18, (2, len(at), 4))
+
+    def keep() -> list[np.ndarray]:
+        found = []
+        for adaptive in (False, True):
+            context = some_networks().exact()
+            context.adaptive, context._features = adaptive, features
+            context._networks[1] = lambda *_: outputs
+            state = packets.State(octree.joined([]), *(np.zeros((400, 22), np.int32) for _ in range(4)))
+            state.index[:] = rng.integers(-(1 << 21), 1 << 21, state.index.shape)
+            found += [state.index.copy(), *context.predict(BLOCKS[1], at, state).__dict__.values()]
+            for moved in (None, more):
+                prediction = packets.Prediction(*found[-3:])
+                tables = packets.kept(prediction, 1, moved, columns, at, state, planes)
+                assert len(np.unique(tables)) > 1 or len(at) == 1
+                found[-3:-3] = [tables, state.mean.copy(), state.scale.copy(), state.multiplier.copy()]
+                found[-3:-3] = [state.units(at, columns)]
+        return found
+
+    rng = np.random.default_rng(6)
+    ours = keep()
+    rng = np.random.default_rng(6)
+    theirs = plain(keep)
+    assert len(ours) == len(theirs)
+    for one, other in zip(ours, theirs, strict=True):
+        assert np.array_equal(one, other)
+
+
 def test_senseless_calls_are_refused():
     shape = {
         "cells": 1,
@@ -192,6 +227,21 @@ def test_senseless_calls_are_refused():
     for changed in ({"first": 2}, {"first": -1}, {"step": 0}, {"start": 19}):
         with pytest.raises(RuntimeError, match=r"row|columns"):
             exact_face.moved(**{"first": 0, "step": 1, "start": 0} | shape | changed)
+    block = torch.zeros(2, 3, dtype=torch.int64)
+    shape = {"mean": block, "scale": block, "multiplier": block, "lower": 0, "tables": torch.zeros(2, 2).byte()}
+    shape |= {"to_mean": splats, "to_scale": splats, "to_multiplier": splats}
+    for changed in ({"first": 2}, {"step": 0}, {"start": 21}, {"begin": 2}, {"begin": -1}):
+        with pytest.raises(RuntimeError, match=r"row|columns"):
+            exact_face.kept(**{"first": 0, "step": 1, "start": 0, "begin": 0} | shape | changed)
+    shape = {"mean": splats, "index": splats, "multiplier": splats, "found": torch.zeros(2, 3, dtype=torch.int64)}
+    for changed in ({"first": 2}, {"step": -1}, {"start": 20}):
+        with pytest.raises(RuntimeError, match=r"row|columns"):
+            exact_face.values(**{"first": 0, "step": 1, "start": 0} | shape | changed)
+    shape = {"features": block, "outputs": torch.zeros(2, 5).long(), "mean": block[:, :2].contiguous()}
+    shape |= {"scale": shape["mean"], "multiplier": shape["mean"]}
+    for start, steps in ((2, [0, 0]), (-1, [0, 0]), (0, [0, 1]), (0, [-1, 0])):
+        with pytest.raises(RuntimeError, match="column"):
+            exact_face.forecasts(start=start, step_of=torch.tensor(steps), **shape)
     words = torch.zeros(8, dtype=torch.uint8)
     for state, zeros in (([0, -1, 0, 3], 5), ([0, 1, 0, 2], 5), ([0, -1, 0, 2], 0)):
         with pytest.raises(RuntimeError, match=r"words|range|zeros"):

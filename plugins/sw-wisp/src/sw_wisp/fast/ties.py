@@ -21,8 +21,8 @@ class Tie(Protocol):
 def moved(
     tie: Tie, before: slice, rows: slice | np.ndarray, parts: tuple[np.ndarray, np.ndarray, np.ndarray],
     sizes: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray] | None:  # fmt: skip
-    """Return additions to means and scale levels; None: there are no kernels, or rows are no slice.
+) -> np.ndarray | None:  # fmt: skip
+    """Return additions [2,n,c] to means and scale levels; None: there are no kernels, or rows are no slice.
 
     parts   indices, scale levels and multipliers [N,22] of all splats
     sizes   [64] of a step under each table
@@ -38,5 +38,4 @@ def moved(
         index=index, scale=scale, multiplier=multiplier, first=rows.start, step=rows.step, start=before.start,
         weights=weights, sizes=torch.from_numpy(sizes), moved=found,
     )  # fmt: skip
-    mean, scales = found.numpy()
-    return mean, scales
+    return found.numpy()
