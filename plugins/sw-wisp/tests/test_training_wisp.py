@@ -262,14 +262,3 @@ def test_latents_may_have_steps_of_their_own(train):
     assert len(ratio[10:].unique()) > 3
     assert ratio.min() >= 1 / 1.5 - 1e-9
     assert ratio.max() <= 1.5 + 1e-9
-
-
-def test_indices_chosen_by_loss_and_bits_take_fewer_bytes(train, toy, rasterizer):
-    found = {}
-    for rdoq in (False, True):
-        method, model = train(
-            context__kind="none", encode__rdoq=rdoq, rate_term__lambda_=1e-3, steps__factor=3.0
-        )  # fmt: skip
-        found[rdoq] = len(file_of(method, model)), psnr(model.eval(), toy.scene, rasterizer)
-    assert found[True][0] < 0.97 * found[False][0]  # of which more than half are networks and tables
-    assert found[True][1] > found[False][1] - 1.0

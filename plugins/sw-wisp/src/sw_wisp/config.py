@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar, Literal
 
 from pydantic import Field, PositiveFloat
-from sw_gaussians.named_blocks import Choosing, OwnCodec
+from sw_gaussians.named_blocks import Choosing, Moved, OwnCodec
 
 from splatwizard_core.api import Params
 from sw_wisp.numbers import LATENTS
@@ -129,12 +130,6 @@ class Loss(Params):
     drop: float = Field(0.0, ge=0, lt=1, description="share of splats that a step leaves out, until integers are fixed")
 
 
-class Encode(Params):
-    """Choice of the integers at the end of a training."""
-
-    rdoq: bool = Field(False, description="of each number the index of least loss and bits; else the nearest")
-
-
 class LayersOfTheFile(Params):
     """Layers: the file comes in packets, and each prefix of them is a scene."""
 
@@ -162,6 +157,7 @@ class WispConfig(Choosing):
     """Everything that can be set for wisp."""
 
     FULL_ITERATIONS: ClassVar[int] = 18_000
+    OLDER: ClassVar[Mapping[str, Moved]] = {"encode.rdoq": Moved((), False)}
 
     iterations: int = Field(18_000, ge=1, le=10**9, description="steps after the scene that it starts from")
     budget: Budget = Field(Budget(), description="how many splats begin")
@@ -174,7 +170,6 @@ class WispConfig(Choosing):
     lr: LearningRates = Field(LearningRates(), description="step sizes")
     appearance: Appearance = Field(Appearance(), description="view dependence")
     loss: Loss = Field(Loss(), description="the rest of the loss")
-    encode: Encode = Field(Encode(), description="how the integers are fixed")
     layers: LayersOfTheFile = Field(LayersOfTheFile(), description="packets of the file")
     codec: Codec = Field(Codec(), description="what writes the file")
 

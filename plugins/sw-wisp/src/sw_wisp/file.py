@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -101,24 +101,8 @@ class Encoded:
     decoded: Decoded
 
 
-class Choice(Protocol):
-    """Indices that an encoder writes for numbers: [n,c] int64 for the values `wanted` [n,c], 1/4096 base steps.
-
-    rows of the scene, `columns` of the 22, and the distributions under which they are coded
-    """
-
-    def __call__(self, wanted: np.ndarray, rows: np.ndarray, columns: slice, known: Prediction) -> np.ndarray: ...
-
-
-def nearest(wanted: np.ndarray, rows: np.ndarray, columns: slice, known: Prediction) -> np.ndarray:
-    """Indices whose values are nearest to those that are wanted."""
-    return np.rint((wanted - known.mean) / known.multiplier).astype(np.int64)
-
-
-def encode(scene: Scene, writer: ContainerWriter, choice: Choice = nearest) -> Encoded:
-    """Write all sections and header values of a scene.
-
-    choice  which indices are written: `nearest`, or what a `RateDistortion` chooses
+def encode(scene: Scene, writer: ContainerWriter) -> Encoded:
+    """Write all sections and header values of a scene; of each number the nearest index.
 
     What was written is decoded again and compared. Raises ValueError for values that are not finite, cells that are
     none, or more than 16 splats in one.
@@ -142,7 +126,7 @@ def encode(scene: Scene, writer: ContainerWriter, choice: Choice = nearest) -> E
     pulled = np.rint(255 * np.clip(strengths, 0, 1)).astype(np.uint8)
 
     def choose(at: np.ndarray, columns: slice, known: Prediction) -> np.ndarray:
-        return choice(units[at, columns], rows[at], columns, known)
+        return np.rint((units[at, columns] - known.mean) / known.multiplier).astype(np.int64)
 
     sizes = {label: len(part) for label, part in zip([s for s, k in order if k == "base"], subsets, strict=True)}
     packets = [Packet(subset, kind, sizes[subset]) for subset, kind in order]

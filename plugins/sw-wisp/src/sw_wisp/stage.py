@@ -36,13 +36,12 @@ from sw_wisp.config import WispConfig
 from sw_wisp.conversion import converted
 from sw_wisp.cube import Cube
 from sw_wisp.fast.replay import release
-from sw_wisp.file import Choice, encode, nearest
+from sw_wisp.file import encode
 from sw_wisp.layers import Layers, split
 from sw_wisp.model import WispModel
 from sw_wisp.numbers import GROUPS, LATENTS
 from sw_wisp.positions import MARGIN, levels_by_cost, middle_scales
 from sw_wisp.prefixes import chosen_order, fitted_swell, packet_bits, psnr_of_prefixes
-from sw_wisp.rdoq import RateDistortion
 from sw_wisp.removal import copy_some, unworthy
 from sw_wisp.rounding import FINAL, HARD, NOISE, SOFT
 from sw_wisp.worth import Worth, loss_of_error, slopes, worth
@@ -267,17 +266,10 @@ class WispStage(Stage):
         self.measure(model)
         self.fit(model, cameras, rasterizer, scene.background.to(model.device), "place")
 
-    def freeze(
-        self, model: WispModel, optimizer: SplatOptimizer, cameras: CameraIterator, rasterizer: Rasterizer,
-        scene: Scene, log: TaskLog,
-    ) -> None:  # fmt: skip
+    def freeze(self, model: WispModel, optimizer: SplatOptimizer, log: TaskLog) -> None:
         """Fix all integers as an encoder does; splats take the order of the file, which decides at equal depths."""
         self.measure(model)
-        choice: Choice = nearest
-        if self.config.encode.rdoq and self.price():
-            with still(model):
-                choice = self.rate_distortion(model, cameras, rasterizer, scene.background.to(model.device))
-        encoded = encode(model.coded(), ContainerWriter("wisp", 1), choice)
+        encoded = encode(model.coded(), ContainerWriter("wisp", 1))
         optimizer.keep_rows(model, torch.from_numpy(encoded.rows).to(model.device))
         model.set_numbers(encoded.decoded.values().to(model.device))
         model.phase = FINAL
@@ -400,13 +392,6 @@ class WispStage(Stage):
         squared = slopes(model, WispModel.NUMBERS, views, rasterizer, background, draws)
         table = torch.cat([squared[name].reshape(model.num_rows, -1) for name in WispModel.NUMBERS], dim=1)
         return table.double() * self.loss_of_error(model, views, rasterizer, background)
-
-    def rate_distortion(
-        self, model: WispModel, views: list[View], rasterizer: Rasterizer, background: Tensor
-    ) -> RateDistortion:
-        """Return what chooses indices by the loss that an error of each number makes, and the price of its bits."""
-        weights = self.weights(model, views, rasterizer, background, "indices").cpu().numpy()
-        return RateDistortion(weights, self.price(), model.rate.base_steps.double().cpu().numpy())
 
     def set_latent_steps(self, model: WispModel, views: list[View], rasterizer: Rasterizer, background: Tensor) -> None:
         """Give each latent the step that makes its error in the pictures as large as that of the others."""
