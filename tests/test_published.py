@@ -29,7 +29,7 @@ NOTHING = {"plan": False, "table": False, "jobs": 0, "gpus": "", "device": "", "
 
 def module(name: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     monkeypatch.syspath_prepend(str(BENCHMARKS))
-    for each in ("sweep_cells", "published", "anchor_starts", "removal_table"):
+    for each in ("sweep_cells", "published", "anchor_starts", "removal_table", "wisp_ladder"):
         monkeypatch.delitem(sys.modules, each, raising=False)
     return importlib.import_module(name)
 
@@ -390,3 +390,38 @@ def test_the_table_of_removal_has_presets_and_scores_at_equal_counts(monkeypatch
     }  # fmt: skip
     status, fake = bench(table, tmp_path / "out", *words)
     assert "19 cells: 19 was there" in capsys.readouterr().out
+
+
+def test_the_ladder_of_wisp_has_its_families_beside_the_baselines(monkeypatch, bench, tmp_path, capsys):
+    ladder = module("wisp_ladder", monkeypatch)
+    words = (
+        "--scene",
+        "demo:tiny",
+        "--cap",
+        "1000",
+        "--views",
+        "50",
+        "--only",
+        "half",
+        "--only",
+        "hac",
+        "--only",
+        "fast",
+    )
+    status, fake = bench(ladder, tmp_path / "out", *words)
+    told = capsys.readouterr().out
+    assert (status, len(fake.commands)) == (0, 1)
+    assert "9 cells: 9 ran" in told
+    assert "half over hac-plus" in told
+    priced = {cell.label: cell.sets for cell in ladder.cells_of("demo:tiny", "", 1000, 50, 1)["priced"]}
+    assert priced["priced-r3"][-1] == "rate_term.lambda_=0.0002"  # half the views: a bit costs twice as much
+    assert all("views" not in each for sets in priced.values() for each in sets)
+
+
+def test_bytes_at_equal_psnr_stand_on_the_lower_hull(monkeypatch):
+    ladder = module("wisp_ladder", monkeypatch)
+    found = [(30.0, 100), (31.0, 400), (32.0, 400), (31.5, 1_000), (29.0, 150)]
+    assert [each[0] for each in ladder.lower_hull(found)] == [30.0, 32.0]
+    assert ladder.ratio(found, 31.0, 400) == pytest.approx(0.5)
+    assert ladder.ratio(found, 29.5, 200) == pytest.approx(0.5)  # the smallest file
+    assert ladder.ratio(found, 32.1, 400) is None
