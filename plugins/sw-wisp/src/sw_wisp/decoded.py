@@ -55,7 +55,7 @@ class Decoded:
     def values(self) -> Tensor:
         """The 22 numbers [N,22] float32 in their own units."""
         every = np.arange(len(self))
-        units = self.state.units(every, slice(None)).astype(np.float64)
+        units: np.ndarray = self.state.units(every, slice(None))
         if self.strengths.any():
             pulled = self.strengths[self.state.planes][:, GROUP_OF_COLUMN] / 255.0  # [N,22]
             pulled[:, OPACITY.columns] = self.strengths[0, 0] / 255.0  # opacity and latents are never coarse
@@ -63,10 +63,11 @@ class Decoded:
             pulled[~self.state.has_view, REFINED.stop :] = 0
             widths = np.ones(units.shape, np.int64)
             widths[:, REFINED] = 3 ** self.state.planes.astype(np.int64)[:, None]
-            units += pulled * self.state.multiplier * to_centroid(self.state.index, self.state.scale, widths)
-        found = units * (self.base_steps / UNIT)
-        found[:, [SIZE.columns.start, OPACITY.columns.start]] += self.swell
-        return torch.from_numpy(found.astype(np.float32))
+            units = units + pulled * self.state.multiplier * to_centroid(self.state.index, self.state.scale, widths)
+        found = torch.from_numpy(units).double() * torch.from_numpy(self.base_steps / UNIT)  # on all cores
+        if self.swell.any():
+            found[:, [SIZE.columns.start, OPACITY.columns.start]] += torch.from_numpy(self.swell)
+        return found.float()
 
     def means(self) -> Tensor:
         """Positions [N,3] float32, world units."""
