@@ -15,6 +15,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
+from sw_wisp.fast.axes import axes as fast_axes
+
 SHAPE = 5
 """Numbers of a deviator."""
 SWEEPS = 5
@@ -80,7 +82,11 @@ def scales_and_quats(shape: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
 
     Axes of equal scales are arbitrary: for the final export, not for anything that learns or is coded.
     """
-    values, vectors = jacobi(six_of(shape.double(), size.double()))
+    six = six_of(shape.detach().double(), size.detach().double())
+    found = fast_axes(six)
+    if found is not None:
+        return found[0].to(size), found[1].to(size)
+    values, vectors = jacobi(six)
     values, order = values.sort(dim=1)
     vectors = vectors.gather(2, order[:, None].expand(-1, 3, 3))
     vectors = vectors * torch.det(vectors).sign()[:, None, None]

@@ -13,7 +13,7 @@ from splatwizard_core.api import BitstreamError, ContainerReader, ContainerWrite
 from sw_codecs.exact_native import EXACT as CODECS
 from sw_codecs.fast import exact_face as codecs_face
 from sw_wisp import file, nested, octree, packets
-from sw_wisp.fast import exact_face, forecasts, running_means, streams, ties
+from sw_wisp.fast import axes, exact_face, forecasts, running_means, streams, ties
 from sw_wisp.fast.exact_native import EXACT
 from sw_wisp.fast.running_means import pyramid_of
 from sw_wisp.fast.streams import FastReader
@@ -21,6 +21,7 @@ from sw_wisp.nested import Reader, Writer
 from sw_wisp.numbers import BLOCKS, PARTS
 from sw_wisp.octree_contexts import Shares
 from sw_wisp.pyramid import BASE, REFINED, VIEW
+from sw_wisp.shape import log_covariance, numbers_of, scales_and_quats
 
 MODULES = (CODECS, EXACT)
 pytestmark = pytest.mark.skipif(
@@ -40,7 +41,7 @@ def plain(monkeypatch):
 
     def call(work):
         with monkeypatch.context() as patch:
-            for module in (streams, running_means, ties, forecasts):
+            for module in (streams, running_means, ties, forecasts, axes):
                 patch.setattr(module, "EXACT", SimpleNamespace(try_load=lambda: False))
             return work()
 
@@ -208,6 +209,26 @@ def test_forecasts_are_kept_as_the_same_integers(plain, rows, planes):
     assert len(ours) == len(theirs)
     for one, other in zip(ours, theirs, strict=True):
         assert np.array_equal(one, other)
+
+
+def test_axes_are_those_of_the_plain_code(plain):
+    draws = torch.Generator().manual_seed(0)
+    six = torch.randn(3_000, 6, dtype=torch.float64, generator=draws)
+    six[:400, [1, 2, 4]] = 0  # axes of the world
+    six[:200, 3] = six[:200, 0]  # two alike
+    six[:100, 5] = six[:100, 0]
+    six[400:800] *= 1e-5
+    numbers = numbers_of(six)
+    ours, theirs = scales_and_quats(*numbers), plain(lambda: scales_and_quats(*numbers))
+    assert torch.allclose(ours[0], theirs[0], rtol=0, atol=1e-12)
+    apart = (theirs[0].diff(dim=1) > 1e-4 * theirs[0].abs().amax(1, keepdim=True)).all(1)  # else any axes will do
+    assert apart[800:].all()
+    found = (ours[1] * theirs[1]).sum(1).abs()  # of rotations by half a turn w is 0, and either sign right
+    assert torch.allclose(found[apart], torch.ones_like(found[apart]), rtol=0, atol=1e-9)
+    assert torch.allclose(ours[1].norm(dim=1), torch.ones(3_000, dtype=torch.float64))
+    again = log_covariance(*ours)
+    for one, other in zip(again, numbers, strict=True):
+        assert torch.allclose(one, other, rtol=0, atol=1e-9)
 
 
 def test_senseless_calls_are_refused():

@@ -1,5 +1,5 @@
-// All operations of the module: running means, what the parts of a block say of those behind them (sw_wisp.ties), and
-// what a walk through packets does with forecasts (sw_wisp.packets).
+// All operations of the module: running means, what the parts of a block say of those behind them (sw_wisp.ties), what
+// a walk through packets does with forecasts (sw_wisp.packets), and axes of decoded splats (sw_wisp.shape).
 #pragma once
 #include "face.h"
 
@@ -66,3 +66,13 @@ typedef struct {
   int64_t* found;             // [n, columns]
 } values_call;
 SW_OPERATION(sw_wisp_exact, values);
+
+// Axes of splats, of the logarithms of the roots of their covariances.
+typedef struct {
+  sw_head head;
+  const double* six;          // [n, 6] xx, xy, xz, yy, yz, zz of each matrix
+  int64_t n;
+  double* log_scales;         // [n, 3] ascending
+  double* quats;              // [n, 4] w, x, y, z of norm 1, w >= 0
+} axes_call;
+SW_OPERATION(sw_wisp_exact, axes);
