@@ -12,6 +12,7 @@ from torch import Tensor
 from sw_wisp.decoded import SWELL_UNIT
 from sw_wisp.numbers import LATENTS, NUMBERS, OPACITY, SIZE
 from sw_wisp.packets import REFINED, default_order
+from sw_wisp.pyramid import prefix_slots
 from sw_wisp.rate import Forecast
 
 Order = tuple[tuple[int, str], ...]
@@ -57,12 +58,16 @@ class Layers:
 
 
 class Known(NamedTuple):
-    """Facts of each subset [J] that packets tell: it is there, missing refinements, latents; what swells it [J,2]."""
+    """Facts of each subset [J] that packets tell: it is there, missing refinements, latents; what swells it [J,2].
+
+    slot    [J] which of the features that latents are predicted from, see `pyramid.prefix_slots`
+    """
 
     there: Tensor
     missing: Tensor
     viewed: Tensor
     swell: Tensor
+    slot: Tensor
 
     @classmethod
     def after(cls, packets: Sequence[tuple[int, str]], layers: Layers, device: torch.device) -> Known:
@@ -73,8 +78,10 @@ class Known(NamedTuple):
             there[subset] |= kind == "base"
             viewed[subset] |= kind == "view"
             missing[subset] -= kind == "fine"
-        facts = (torch.tensor(each, device=device) for each in (there, missing, viewed))
-        return cls(*facts, layers.swell_with(sum(there), device))
+        slots = prefix_slots(packets)[-1]
+        slots += [0] * (layers.subsets - len(slots))
+        facts = [torch.tensor(each, device=device) for each in (there, missing, viewed, slots)]
+        return cls(*facts[:3], layers.swell_with(sum(there), device), facts[3])
 
     def of(self, subsets: Tensor) -> Known:
         """Return the same for splats of these subsets [N]."""

@@ -46,6 +46,8 @@ class WispModel(SplatModel):
     subsets     [N] int64, which subset of the file it belongs to
     features, view_features
                 [N,69] what networks of the rate model see of the splats before; only where it has networks
+    prefix_features
+                [N,K,69] the same for latents that prefixes lack, see `pyramid.prefix_slots`; K is 0 without layers
     network     latents and colour to SH bands 1 and up
     rate        distributions of the 22 numbers
     cube        the root cube of the octree
@@ -66,6 +68,9 @@ class WispModel(SplatModel):
 
     levels: Tensor
     subsets: Tensor
+    features: Tensor
+    view_features: Tensor
+    prefix_features: Tensor
 
     def __init__(
         self, means: Tensor, opacity: Tensor, shape: Tensor, size: Tensor, colour: Tensor, latents: Tensor,
@@ -84,6 +89,9 @@ class WispModel(SplatModel):
             if name not in self.ROWS:
                 self.register_buffer(name, means.new_zeros(len(means), FEATURES))
                 self.ROWS = (*self.ROWS, name)
+        if isinstance(rate, PyramidRate):
+            self.register_buffer(rate.OF_PREFIXES, means.new_zeros(len(means), 0, FEATURES))
+            self.ROWS = (*self.ROWS, rate.OF_PREFIXES)
         self.network, self.rate = network, rate
         self.cube = cube
         self.phase, self.sharpness, self.sharpest, self.jitters, self.adapts = FLOAT, 1.0, sharpest, False, False
@@ -122,6 +130,15 @@ class WispModel(SplatModel):
     def _context(self) -> tuple[Tensor, ...]:
         return tuple(getattr(self, name) for name in self.rate.CONTEXT)
 
+    def _context_of(self, known: Known) -> tuple[Tensor, ...]:
+        """The same, where latents that a prefix lacks are predicted from what it tells, as a decoder does."""
+        if not isinstance(self.rate, PyramidRate) or not self.prefix_features.shape[1]:
+            return self._context
+        slot = known.slot[self.subsets][:, None]
+        at = (slot - 1).clamp_min(0)[:, :, None].expand(-1, -1, FEATURES)
+        early = self.prefix_features.gather(1, at).squeeze(1)
+        return self.features, torch.where(slot > 0, early, self.view_features)
+
     @property
     def rounding(self) -> Rounding:
         """Stand-in for rounding."""
@@ -144,7 +161,7 @@ class WispModel(SplatModel):
             return rows if sample is None else torch.cat([rows[:first], rows.index_select(0, sample)])
 
         # The sample stands behind all splats, under noise of its own, so that networks run once.
-        context = tuple(behind(each) for each in self._context)
+        context = tuple(behind(each) for each in (self._context if known is None else self._context_of(known)))
         rounding = replace(self.rounding, drawn_noise=draws.noise, soft=draws.soft)
         forecast, drawn = self.rate.predict(context, behind(numbers), rounding)
         if sample is None:
@@ -175,11 +192,14 @@ class WispModel(SplatModel):
     def _placed(self) -> Placed:
         cells = self.cube.cells(self.means, self.levels)
         order, planes = self.layers.order, self.layers.planes
-        return Placed(self.numbers().detach(), self.levels, cells, self.subsets, order, planes)
+        return Placed(self.numbers().detach(), self.levels, cells, self.subsets, order, planes, bool(order))
 
     def _take(self, rows: Mapping[str, Tensor]) -> None:
         for name, values in rows.items():
-            getattr(self, name).copy_(values)  # a step that is replayed reads them where they stand
+            if getattr(self, name).shape == values.shape:
+                getattr(self, name).copy_(values)  # a step that is replayed reads them where they stand
+            else:  # another order of packets
+                setattr(self, name, values)
 
     @torch.no_grad()
     def place_bits(self) -> Tensor:
@@ -224,7 +244,7 @@ class WispModel(SplatModel):
         """The same, where latents are predicted from what these packets tell alone: a decoder has no others."""
         if not isinstance(self.rate, PyramidRate):
             return forecast
-        told = replace(self._placed(), order=tuple(packets))
+        told = replace(self._placed(), order=tuple(packets), prefixes=False)
         walked = self.rate.measure(told, self._context, fixed=self.phase == FINAL)
         context = (self._context[0], walked["view_features"])
         mean = self.rate.predict(context, self.numbers(), self.rounding)[0].mean

@@ -37,8 +37,8 @@ def packet_bits(values: Tensor, forecast: Forecast, places: Tensor, planes: int)
     values      [N,22] as rounded
     places      [N] bits of their places
     """
-    facts = (places.new_full((len(places),), x, dtype=torch.int64) for x in (1, planes))
-    known = Known(*facts, places >= 0, values.new_zeros(len(values), 2))
+    there, missing, slot = (places.new_full((len(places),), x, dtype=torch.int64) for x in (1, planes, 0))
+    known = Known(there, missing, places >= 0, values.new_zeros(len(values), 2), slot)
     widths = values.new_ones(NUMBERS)
     widths[REFINED] = 3.0**planes
     scale = forecast.scale - (widths > 1) * (planes * THIRD_OF_SCALE / UNIT)

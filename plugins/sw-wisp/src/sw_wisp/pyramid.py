@@ -201,8 +201,9 @@ def walked_features(
     order: Sequence[tuple[int, str]] | None = None,
     planes: int = 0,
     multipliers: Tensor | None = None,
+    prefixes: bool = False,
     make: Callable[[Tensor], Pyramid] = Pyramid,
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, ...]:
     """Features of all splats as a file would have them: for latents and for all before them, each [N,69] float32.
 
     prior       [22] whole numbers, base steps with 12 fractional bits
@@ -212,6 +213,9 @@ def walked_features(
     order       (subset, kind) of each packet; None: `default_order`. Where it lacks a `view`, as a prefix does, latents
                 are predicted at the end, as decoders do
     planes      refinements, and `multipliers` [N,22] steps in base steps; None: 1
+
+    prefixes    return a third [N,K,69]: those of latents after packets that end before `view`, in turn, where
+                `prefix_slots` says
 
     Those of latents come second. All tensors on one device. `make`: the class, or `running_means.pyramid_of`.
     """
@@ -225,6 +229,8 @@ def walked_features(
     pyramid = make(prior)
     found = [torch.zeros(len(levels), FEATURES, device=values.device) for _ in range(2)]
     left: dict[int, int] = {}
+    slots = prefix_slots(order)
+    early = found[0].new_zeros(len(levels), max(map(max, slots), default=0) if prefixes else 0, FEATURES)
     number = torch.empty_like(levels)  # of each row in the pyramid
 
     def at_hand(rows: Tensor, missing: int) -> tuple[Tensor, Tensor]:
@@ -233,7 +239,7 @@ def walked_features(
         index[:, REFINED] = ((index[:, REFINED] + (width - 1) // 2) / width).floor() * width
         return units[rows, BASE] + (index - indices[rows, BASE]) * steps[rows, BASE], index
 
-    for subset, kind in order:
+    for known, (subset, kind) in enumerate(order, 1):
         rows = by_place[labels[by_place] == subset]
         parts = waves(rows, WAVES[len(left) > 0 and subset != next(iter(left))])
         if kind == "base":
@@ -251,8 +257,28 @@ def walked_features(
             for part in parts:
                 found[1][part] = pyramid.features(number[part]).float() / UNIT
                 pyramid.add(number[part], VIEW, units[part, VIEW], indices[part, VIEW])
+        for waiting, slot in enumerate(slots[known]):
+            if slot and prefixes:
+                rows = by_place[labels[by_place] == waiting]
+                early[rows, slot - 1] = pyramid.features(number[rows]).float() / UNIT
     unseen = [subset for subset in left if (subset, "view") not in order]
     if unseen:
         rows = by_place[torch.isin(labels[by_place], torch.tensor(unseen, device=labels.device))]
         found[1][rows] = pyramid.features(number[rows]).float() / UNIT
-    return found[0], found[1]
+    return (*found, early) if prefixes else (*found,)
+
+
+def prefix_slots(order: Sequence[tuple[int, str]]) -> list[list[int]]:
+    """Return for 0, 1, ... packets and each subset the number, from 1 on, of prefixes that have lacked its `view`.
+
+    0 where the `view` is there, or nothing of the subset is.
+    """
+    found = [[0] * (max((subset for subset, _ in order), default=0) + 1)]
+    waiting: dict[int, int] = {}
+    for subset, kind in order:
+        waiting |= {subset: 0} if kind == "base" else {}
+        if kind == "view":
+            del waiting[subset]
+        waiting = {each: count + 1 for each, count in waiting.items()}
+        found.append([waiting.get(each, 0) for each in range(len(found[0]))])
+    return found

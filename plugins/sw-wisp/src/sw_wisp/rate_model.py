@@ -54,6 +54,7 @@ class Placed:
     subsets     [N] int64 which subset of the file each belongs to; None: all to one
     order       (subset, kind) of each packet; empty: that of one subset
     planes      refinements that come after the first packet of a subset
+    prefixes    whether prefixes of these packets are measured too
     """
 
     values: Tensor
@@ -62,6 +63,7 @@ class Placed:
     subsets: Tensor | None = None
     order: Sequence[tuple[int, str]] = ()
     planes: int = 0
+    prefixes: bool = False
 
 
 def bits_of(values: Tensor, forecast: Forecast, last: int | None = None) -> Tensor:
@@ -163,6 +165,7 @@ class PyramidRate(nn.Module):
     """
 
     CONTEXT = ("features", "view_features")
+    OF_PREFIXES = "prefix_features"
 
     def __init__(
         self, steps: Tensor, *, adaptive: bool, size: str = "large", generator: torch.Generator | None = None
@@ -188,9 +191,9 @@ class PyramidRate(nn.Module):
         units = splats.values / self.base_steps
         self.networks.measure_prior(units)
         features = self._features(splats, units, (units - self.networks.prior / UNIT).round(), torch.ones_like(units))
-        self.networks.start(*features, units)
+        self.networks.start(*features[: len(self.CONTEXT)], units)
         self._set_steps()
-        return dict(zip(self.CONTEXT, features, strict=True))
+        return dict(zip((*self.CONTEXT, self.OF_PREFIXES), features, strict=False))
 
     def _set_steps(self) -> None:
         """Make the steps those to begin with, deviations as they are."""
@@ -235,12 +238,14 @@ class PyramidRate(nn.Module):
         forecast, drawn = self._predict(context, splats.values, AS_THEY_ARE if fixed else Rounding(HARD), True)
         indices = ((drawn - forecast.mean) / forecast.steps).round()
         steps = forecast.steps / self.base_steps
-        return dict(zip(self.CONTEXT, self._features(splats, drawn / self.base_steps, indices, steps), strict=True))
+        names = (*self.CONTEXT, self.OF_PREFIXES)
+        return dict(zip(names, self._features(splats, drawn / self.base_steps, indices, steps), strict=False))
 
-    def _features(self, splats: Placed, units: Tensor, indices: Tensor, steps: Tensor) -> tuple[Tensor, Tensor]:
+    def _features(self, splats: Placed, units: Tensor, indices: Tensor, steps: Tensor) -> tuple[Tensor, ...]:
         return walked_features(
             self.networks.prior, splats.levels, splats.cells, units, indices, labels=splats.subsets,
-            order=splats.order or None, planes=splats.planes, multipliers=steps, make=pyramid_of,
+            order=splats.order or None, planes=splats.planes, multipliers=steps, prefixes=splats.prefixes,
+            make=pyramid_of,
         )  # fmt: skip
 
     def predict(self, context: tuple[Tensor, ...], values: Tensor, rounding: Rounding) -> tuple[Forecast, Tensor]:
