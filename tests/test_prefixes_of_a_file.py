@@ -65,7 +65,7 @@ def test_a_size_takes_the_longest_cut_that_fits(capsys, tmp_path):
     assert not (tmp_path / "none.swz").exists()
 
 
-def test_what_ends_at_no_cut_is_truncated_and_partial_takes_what_is_whole(capsys, tmp_path):
+def test_what_ends_at_no_cut_is_truncated_and_partial_takes_what_is_whole(capsys, caplog, tmp_path):
     broken, cuts = tmp_path / "broken.swz", told(capsys, "info", PACKETS)["cuts"]
     broken.write_bytes(PACKETS.read_bytes()[: cuts[2]["bytes"] - 1])
     for command in (("decode", broken), ("truncate", broken, "--packets", 1, "--out", tmp_path / "x.swz")):
@@ -74,10 +74,23 @@ def test_what_ends_at_no_cut_is_truncated_and_partial_takes_what_is_whole(capsys
         assert f"packet 2 ({cuts[1]['bytes']:,} bytes): --partial" in error
     whole = told(capsys, "decode", PACKETS, "--packets", 2, "--repeats", 0)
     assert told(capsys, "decode", broken, "--partial", "--repeats", 0)["digest"] == whole["digest"]
+    missing, over = (cuts[3]["bytes"] - cuts[2]["bytes"] + 1, cuts[2]["bytes"] - 1 - cuts[1]["bytes"])
+    assert f"its last {missing:,} bytes are missing: 2 of 4 packets are there" in caplog.text
+    assert f"{over:,} bytes behind the last whole packet are left out" in caplog.text
     assert "another file than the source" in refused(capsys, "truncate", broken, "--partial", "--out", broken)
     mended = tmp_path / "mended.swz"
     told(capsys, "truncate", broken, "--partial", "--out", mended)
     assert told(capsys, "decode", mended, "--repeats", 0)["digest"] == whole["digest"]
+
+
+def test_partial_leaves_out_what_follows_the_last_packet(capsys, caplog, tmp_path):
+    longer = tmp_path / "longer.swz"
+    longer.write_bytes(PACKETS.read_bytes() + b"more")
+    assert "4 bytes follow the last section: the file is damaged; --partial leaves" in refused(capsys, "decode", longer)
+    whole = told(capsys, "decode", PACKETS, "--repeats", 0)
+    assert told(capsys, "decode", longer, "--partial", "--repeats", 0)["digest"] == whole["digest"]
+    assert "longer.swz: 4 bytes behind the last whole packet are left out" in caplog.text
+    assert "missing" not in caplog.text
 
 
 def test_eval_measures_each_prefix_as_the_file_that_ends_there(capsys, tmp_path):

@@ -85,3 +85,12 @@ def chosen_cut(cuts: Sequence[Cut], length: int, header: int, prefix: Prefix, na
     if found < 1:
         raise UserInputError(f"{name}: its first packet ends at {ends[0]:,} bytes, less is no scene")
     return found
+
+
+def told_lost(cuts: Sequence[Cut], length: int) -> str:
+    """Return what a file lacks that has `length` bytes behind its header, and what of it is of no use; "": nothing."""
+    there = sum(cut.bytes <= length for cut in cuts)
+    missing, over = cuts[-1].bytes - length, length - cuts[there - 1].bytes
+    told = [f"its last {missing:,} bytes are missing: {there} of {len(cuts)} packets are there"] if missing > 0 else []
+    told += [f"{over:,} bytes behind the last whole packet are left out"] if over else []
+    return "; ".join(told)
