@@ -19,6 +19,7 @@ from sw_wisp.method import Wisp
 from sw_wisp.model import WispModel
 from sw_wisp.packets import Packet, check_order
 from sw_wisp.prefixes import fitted_swell, packet_bits, squared_error
+from sw_wisp.pyramid import prefix_slots
 from sw_wisp.rate import Forecast
 from sw_wisp.rounding import HARD
 
@@ -48,8 +49,13 @@ def on_one_thread(train, **values):
 
 
 @pytest.fixture(scope="module")
-def data(train):
-    return file_of(*on_one_thread(train))
+def whole(train):
+    return on_one_thread(train)
+
+
+@pytest.fixture(scope="module")
+def data(whole):
+    return file_of(*whole)
 
 
 @pytest.fixture(scope="module")
@@ -86,9 +92,8 @@ def test_what_is_drawn_of_a_prefix_is_what_decoders_draw(plain, plugins, toy, ra
         assert torch.allclose(*images, atol=2e-3), cut
 
 
-def test_packets_are_weighed_by_latents_that_decoders_predict(train, plugins, toy, rasterizer):
-    method, model = on_one_thread(train)
-    data, model = file_of(method, model), copy.deepcopy(model).eval()
+def test_packets_are_weighed_by_latents_that_decoders_predict(whole, data, plugins, toy, rasterizer):
+    model = copy.deepcopy(whole[1]).eval()
     camera, errors = toy.scene.test[0].camera, []
     with torch.no_grad():
         forecast, drawn = model.predicted()
@@ -112,6 +117,28 @@ def test_a_step_that_draws_packets_draws_what_decoders_do(plain):
         assert torch.allclose(shown.covariances, decoded.cov3d)
         assert torch.equal(shown.visible, decoded.visible)
     assert any(any(row) for row in model.layers.swell)
+
+
+def test_a_step_that_draws_packets_predicts_latents_as_decoders_do(whole, data, plugins, toy, rasterizer):
+    model, view = copy.deepcopy(whole[1]).train(), toy.scene.test[0]
+    for number, cut in list(enumerate(ContainerReader(data).cuts, 1))[:-1]:
+        model.packets = cut.sections - 1
+        with torch.no_grad():
+            ours, theirs = (
+                rasterizer.render(each.gaussians(view.camera, rasterizer), view.camera, RasterOptions()).image
+                for each in (model, prefix(plugins, data, number))
+            )
+            wrong = (theirs - view.image(toy.scene.background, theirs.device)).square().mean()
+        # Coarse numbers, which networks are told finely in training, make the rest of it.
+        assert (ours - theirs).square().mean() < wrong / 300, number
+
+
+def test_prefixes_that_lack_latents_are_counted():
+    order = ((0, "base"), (1, "base"), (0, "view"), (1, "fine"), (1, "view"))
+    assert prefix_slots(order) == [[0, 0], [1, 0], [2, 1], [0, 2], [0, 3], [0, 0]]
+    layers = Layers(order, 1)
+    known = [Known.after(order[:packets], layers, torch.device("cpu")).slot.tolist() for packets in range(6)]
+    assert known == prefix_slots(order)
 
 
 def test_subsets_that_are_formed_early_stay_while_splats_go(plugins):

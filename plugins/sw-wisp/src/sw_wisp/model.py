@@ -165,7 +165,9 @@ class WispModel(SplatModel):
         rounding = replace(self.rounding, drawn_noise=draws.noise, soft=draws.soft)
         forecast, drawn = self.rate.predict(context, behind(numbers), rounding)
         if sample is None:
-            return drawn if known is None else as_known(drawn, forecast, known.of(self.subsets)), None
+            if known is not None:
+                drawn = as_known(drawn, self.rate.without_latents(forecast, drawn), known.of(self.subsets))
+            return drawn, None
         bits = bits_of(drawn, forecast, len(sample)).sum() / len(sample)
         return drawn[:first] if first else numbers, bits
 
@@ -247,7 +249,7 @@ class WispModel(SplatModel):
         told = replace(self._placed(), order=tuple(packets), prefixes=False)
         walked = self.rate.measure(told, self._context, fixed=self.phase == FINAL)
         context = (self._context[0], walked["view_features"])
-        mean = self.rate.predict(context, self.numbers(), self.rounding)[0].mean
+        mean = self.rate.without_latents(*self.rate.predict(context, self.numbers(), self.rounding)).mean
         start = LATENTS.columns.start
         return forecast._replace(mean=torch.cat([forecast.mean[:, :start], mean[:, start:]], dim=1))
 
