@@ -14,12 +14,12 @@ from sw_codecs.context.two_layers import two_layers
 from sw_codecs.entropy.exact_tables import exact_tables
 from sw_wisp.eight_bits import EXACT_EXPONENT, EightBitLayer, rounded_weights
 from sw_wisp.nested import UNIT
-from sw_wisp.numbers import BASE_STEPS, BLOCKS, LATENTS, NUMBERS, PARTS
+from sw_wisp.numbers import BASE_STEPS, BLOCKS, NUMBERS, PARTS
 from sw_wisp.predicting import STEPS_OF, PyramidContext, network_shapes
 from sw_wisp.rate import Forecast, level_of, sigma_of
 from sw_wisp.rounding import AS_THEY_ARE, Rounding
 from sw_wisp.static import MEAN_UNIT
-from sw_wisp.ties import LARGEST_SIZE, ROUNDING, tie_shapes, tied_parts
+from sw_wisp.ties import LARGEST_SIZE, ROUNDING, tie_shapes
 
 LARGEST_PRIOR = 32767 * MEAN_UNIT
 
@@ -106,16 +106,12 @@ class ContextNetworks(nn.Module):
         mean = own.mean + F.linear(residuals, weights[:half]) * unit
         return Forecast(mean, own.scale + F.linear(sizes, weights[half:]), own.steps)
 
-    def without_latents(self, forecast: Forecast, drawn: Tensor) -> Forecast:
-        """The forecast of a decoder that lacks the latents: none of them has moved the means of others."""
-        residual = ((drawn - forecast.mean) / self.base_steps).detach()
-        mean = [forecast.mean[:, : LATENTS.columns.start + PARTS[-1][0].stop - PARTS[-1][0].start]]
-        for tie, (part, before) in zip(self.ties, tied_parts(), strict=True):
-            if before.start == LATENTS.columns.start:
-                weights = rounded_weights(tie.detach(), EXACT_EXPONENT) if self.rounds else tie.detach()
-                moved = F.linear(residual[:, before], weights[: len(weights) // 2]) * self.base_steps[part]
-                mean.append(forecast.mean[:, part] - moved)
-        return forecast._replace(mean=torch.cat(mean, dim=1))
+    def latents(self, view_features: Tensor, told: Tensor) -> Tensor:
+        """Means [N,12] of latents that a decoder lacks, from numbers [N,22] that it has of the same splats."""
+        block = BLOCKS[-1]
+        known = (told / self.base_steps)[:, : block.start].detach()
+        out = self._evaluate(len(BLOCKS) - 1, torch.cat([view_features, known], dim=1))
+        return (view_features[:, block] + out[:, : block.stop - block.start]) * self.base_steps[block]
 
     def _evaluate(self, number: int, inputs: Tensor) -> Tensor:
         first, _, last = self.networks[number]  # type: ignore[misc, union-attr]

@@ -18,7 +18,9 @@ from sw_wisp.rate import Forecast
 Order = tuple[tuple[int, str], ...]
 """(subset, kind) of each packet."""
 LEVEL_TERM = 0.3
-"""Of the priority of a splat, for each level that it lies below the mean level."""
+"""Of the priority of a splat, for each level that it lies deeper."""
+AT_ONCE = 0.12
+"""Of the splats that are left, those that go before costs are measured anew."""
 LEAST_WORTH = 0.01
 """Quantile of the positive costs of removal that those below it count as."""
 
@@ -93,13 +95,18 @@ def as_known(values: Tensor, forecast: Forecast, known: Known) -> Tensor:
 
     known   of each splat
     """
+    values = swelled(coarsened(values, forecast, known), known.swell)
+    latents = torch.where(known.viewed[:, None], values[:, LATENTS.columns], forecast.mean[:, LATENTS.columns])
+    return torch.cat([values[:, : LATENTS.columns.start], latents], dim=1)
+
+
+def coarsened(values: Tensor, forecast: Forecast, known: Known) -> Tensor:
+    """Return values [N,22] without the refinements that are missing; gradients pass straight."""
     width = torch.ones_like(values)
     width[:, REFINED] = 3.0 ** known.missing[:, None]
     offsets = ((values - forecast.mean) / forecast.steps).detach()
     coarse = torch.where(width > 1, (torch.round(offsets / width) * width - offsets) * forecast.steps.detach(), 0.0)
-    values = swelled(values + coarse, known.swell)
-    latents = torch.where(known.viewed[:, None], values[:, LATENTS.columns], forecast.mean[:, LATENTS.columns])
-    return torch.cat([values[:, : LATENTS.columns.start], latents], dim=1)
+    return values + coarse
 
 
 def swelled(values: Tensor, swell: Tensor) -> Tensor:
@@ -110,22 +117,39 @@ def swelled(values: Tensor, swell: Tensor) -> Tensor:
     return values + torch.cat(parts, dim=1)
 
 
-def split(worth: Tensor, bits: Tensor, base: Tensor, levels: Tensor, shares: Sequence[float]) -> Tensor:
-    """Return the subset [N] int64 of each splat: those worth most for their bits first, coarse cells before fine ones.
+def split(
+    costs: Callable[[Tensor], Tensor], bits: Tensor, base: Tensor, levels: Tensor, shares: Sequence[float]
+) -> Tensor:
+    """Return the subset [N] int64 of each splat: those go last that cost least for their bits, fine cells first.
 
-    worth   [N] what the pictures lose without it; bits [N] of its numbers and place
+    costs   (there [N] bool) -> [N], what pictures of those that are there lose without each of them
+    bits    [N] of a splat's numbers and place; levels [N]
     base    [N] bits of its first packet, of which each subset gets its share
+
+    Costs are measured anew whenever AT_ONCE of the splats have gone: of two that cover each other one stays.
     """
-    positive = worth[worth > 0].double()
-    floor = torch.quantile(positive[: 1 << 24], LEAST_WORTH) if len(positive) else worth.new_ones(())
-    depth = levels.double() - levels.double().mean()
-    priority = (worth.double().clamp_min(float(floor)) / bits.double()).log() - LEVEL_TERM * depth
-    order = torch.argsort(priority, descending=True, stable=True)
-    spent = base[order].double().cumsum(0)
-    ends = torch.tensor(shares, dtype=torch.float64, device=worth.device).cumsum(0)
-    ends = ends[:-1] / ends[-1] * spent[-1]
+    sizes, there = base.double(), torch.ones_like(levels, dtype=torch.bool)
+    ends = torch.tensor(shares, dtype=torch.float64, device=bits.device).cumsum(0)
+    ends = ends * (sizes.sum() / ends[-1])
+    penalty = bits.double().log() + LEVEL_TERM * levels.double()
+    gone: list[Tensor] = []
+    worth = costs(there).double()
+    positive = worth[worth > 0]
+    floor = float(torch.quantile(positive[: 1 << 24], LEAST_WORTH)) if len(positive) else 1.0
+    while True:
+        rows = there.nonzero().squeeze(1)
+        priority = worth[rows].clamp_min(floor).log() - penalty[rows]
+        order = rows[torch.argsort(priority, descending=True, stable=True)]
+        enough = int((sizes[order].cumsum(0) < ends[0]).sum()) + 1
+        kept = max(enough, int((1 - AT_ONCE) * len(order)))
+        gone.insert(0, order[kept:])
+        there[order[kept:]] = False
+        if kept == enough:
+            break
+        worth = costs(there).double()
+    order = torch.cat([order[:kept], *gone])
     found = torch.empty_like(levels)
-    found[order] = torch.searchsorted(ends, spent - base[order].double() / 2)
+    found[order] = torch.searchsorted(ends[:-1], sizes[order].cumsum(0) - sizes[order] / 2)
     return found
 
 

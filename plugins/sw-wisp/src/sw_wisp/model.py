@@ -18,7 +18,7 @@ from sw_wisp.fast import replay
 from sw_wisp.fast.kernels import fit_kernels
 from sw_wisp.fast.splats import drawable as fast_drawable
 from sw_wisp.file import Scene
-from sw_wisp.layers import Known, Layers, as_known
+from sw_wisp.layers import Known, Layers, as_known, coarsened
 from sw_wisp.numbers import GROUPS, LATENTS, NUMBERS, SIZE
 from sw_wisp.octree import Cells, position_bits
 from sw_wisp.plain import bounds_in, plain_gaussians
@@ -130,14 +130,18 @@ class WispModel(SplatModel):
     def _context(self) -> tuple[Tensor, ...]:
         return tuple(getattr(self, name) for name in self.rate.CONTEXT)
 
-    def _context_of(self, known: Known) -> tuple[Tensor, ...]:
-        """The same, where latents that a prefix lacks are predicted from what it tells, as a decoder does."""
-        if not isinstance(self.rate, PyramidRate) or not self.prefix_features.shape[1]:
-            return self._context
-        slot = known.slot[self.subsets][:, None]
-        at = (slot - 1).clamp_min(0)[:, :, None].expand(-1, -1, FEATURES)
-        early = self.prefix_features.gather(1, at).squeeze(1)
-        return self.features, torch.where(slot > 0, early, self.view_features)
+    def _without_latents(self, forecast: Forecast, drawn: Tensor, known: Known, seen: Tensor | None) -> Forecast:
+        """The same forecast, but for latents that are missing: predicted from what a decoder knows instead of them.
+
+        known   of each splat; seen [N,69] its features for latents, None: those of the prefix that `known` is of
+        """
+        if not isinstance(self.rate, PyramidRate) or (seen is None and not self.prefix_features.shape[1]):
+            return forecast
+        if seen is None:
+            at = (known.slot - 1).clamp_min(0)[:, None, None].expand(-1, -1, FEATURES)
+            seen = self.prefix_features.gather(1, at).squeeze(1)
+        latents = self.rate.networks.latents(seen, coarsened(drawn, forecast, known))
+        return forecast._replace(mean=torch.cat([forecast.mean[:, : LATENTS.columns.start], latents], dim=1))
 
     @property
     def rounding(self) -> Rounding:
@@ -161,12 +165,13 @@ class WispModel(SplatModel):
             return rows if sample is None else torch.cat([rows[:first], rows.index_select(0, sample)])
 
         # The sample stands behind all splats, under noise of its own, so that networks run once.
-        context = tuple(behind(each) for each in (self._context if known is None else self._context_of(known)))
+        context = tuple(behind(each) for each in self._context)
         rounding = replace(self.rounding, drawn_noise=draws.noise, soft=draws.soft)
         forecast, drawn = self.rate.predict(context, behind(numbers), rounding)
         if sample is None:
             if known is not None:
-                drawn = as_known(drawn, self.rate.without_latents(forecast, drawn), known.of(self.subsets))
+                known = known.of(self.subsets)
+                drawn = as_known(drawn, self._without_latents(forecast, drawn, known, None), known)
             return drawn, None
         bits = bits_of(drawn, forecast, len(sample)).sum() / len(sample)
         return drawn[:first] if first else numbers, bits
@@ -242,16 +247,14 @@ class WispModel(SplatModel):
         return self._shown(*self.drawn_and_bits(draws), draws.places)._replace(visible=visible)
 
     @torch.no_grad()
-    def forecast_with(self, packets: Sequence[tuple[int, str]], forecast: Forecast) -> Forecast:
+    def forecast_with(self, packets: Sequence[tuple[int, str]], forecast: Forecast, drawn: Tensor) -> Forecast:
         """The same, where latents are predicted from what these packets tell alone: a decoder has no others."""
         if not isinstance(self.rate, PyramidRate):
             return forecast
         told = replace(self._placed(), order=tuple(packets), prefixes=False)
         walked = self.rate.measure(told, self._context, fixed=self.phase == FINAL)
-        context = (self._context[0], walked["view_features"])
-        mean = self.rate.without_latents(*self.rate.predict(context, self.numbers(), self.rounding)).mean
-        start = LATENTS.columns.start
-        return forecast._replace(mean=torch.cat([forecast.mean[:, :start], mean[:, start:]], dim=1))
+        known = Known.after(packets, self.layers, self.device).of(self.subsets)
+        return self._without_latents(forecast, drawn, known, walked["view_features"])
 
     def prefix_of(
         self, packets: Sequence[tuple[int, str]], forecast: Forecast, drawn: Tensor, swell: Tensor | None = None

@@ -61,7 +61,7 @@ def chosen_order(model: WispModel, views: Sequence[View], rasterizer: Rasterizer
     sums["fine"] /= max(model.layers.planes, 1)
 
     def error(packets: Sequence[tuple[int, str]]) -> float:
-        seen = model.prefix_of(packets, model.forecast_with(packets, forecast), drawn)
+        seen = model.prefix_of(packets, model.forecast_with(packets, forecast, drawn), drawn)
         return squared_error(seen, views, rasterizer, background)
 
     return greedy_order(model.layers, error, lambda packet: float(sums[packet[1]][packet[0]]))
@@ -94,7 +94,7 @@ def fitted_swell(
     order, options, found = model.layers.order, RasterOptions(background=background), []
     for there in range(1, model.layers.subsets):
         ends = [n for n in range(1, len(order)) if sum(kind == "base" for _, kind in order[:n]) == there]
-        forecasts = [model.forecast_with(order[:end], forecast) for end in ends]
+        forecasts = [model.forecast_with(order[:end], forecast, drawn) for end in ends]
         swell = model.layers.swell_with(there, model.device).requires_grad_()
         optimizer = torch.optim.Adam([swell], lr=SWELL_LR)
         for update in range(updates):

@@ -147,10 +147,6 @@ class StaticRate(nn.Module):
         drawn = rounding.drawn(values, means, steps, rounding.noise(values))
         return Forecast(means, self.tables.float()[row], steps), drawn
 
-    def without_latents(self, forecast: Forecast, drawn: Tensor) -> Forecast:
-        """Return the forecast: no number moves another."""
-        return forecast
-
     def round_weights(self) -> None:
         """Do nothing: there are no weights."""
 
@@ -262,10 +258,6 @@ class PyramidRate(nn.Module):
         predict = partial(predicted, self.networks) if fit_kernels(values, *context) else self.networks
         found: tuple[Forecast, Tensor] = predict(*context, values, rounding, moves_steps=moves_steps)
         return found
-
-    def without_latents(self, forecast: Forecast, drawn: Tensor) -> Forecast:
-        """Return the forecast of values that are drawn, of a decoder that lacks their latents."""
-        return self.networks.without_latents(forecast, drawn)
 
     def round_weights(self) -> None:
         """Compute with the weights of the file, of eight bits, from here on."""

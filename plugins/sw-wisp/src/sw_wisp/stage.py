@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 import torch
+from sw_gaussians.removal import removal_costs
 from torch import Tensor
 
 from splatwizard_core.api import (
@@ -316,12 +317,15 @@ class WispStage(Stage):
         """Put splats into the subsets of the file, those worth most for their bits into the first."""
         layers = self.config.layers
         with still(model):
-            found = self.worth(model, cameras, rasterizer, scene.background.to(model.device))
             forecast, drawn = model.predicted()
-            places = model.place_bits().float()
-        bits = packet_bits(drawn, forecast, places, layers.planes)
-        whole = bits["base"] + bits["fine"] + bits["view"]
-        model.subsets = split(found.squared_error, whole, bits["base"], model.levels, layers.shares)
+            bits = packet_bits(drawn, forecast, model.place_bits().float(), layers.planes)
+            every = model.gaussians(cameras[0].camera, rasterizer)  # the same whatever the camera
+
+            def costs(there: Tensor) -> Tensor:
+                seen = replace(every, visible=there)
+                return removal_costs(lambda camera: seen, cameras, rasterizer, scene.background.to(model.device)).cost
+
+            model.subsets = split(costs, sum(bits.values()), bits["base"], model.levels, layers.shares)
         model.layers = Layers.of_subsets(len(layers.shares), layers.planes)
         self.measure(model)
 
