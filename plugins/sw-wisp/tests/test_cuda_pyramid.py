@@ -21,7 +21,7 @@ def test_features_are_the_same_integers_on_cuda(subsets, planes):
             t.to(device) for t in (torch.arange(NUMBERS) * 160, scene.levels, scene.cells, values, values.round())
         ]
         on_device = None if labels is None else labels.to(device)
-        found.append(walked_features(*tensors, labels=on_device, planes=planes))
+        found.append(walked_features(*tensors, labels=on_device, planes=planes, prefixes=True))
     for here, there in zip(*found, strict=True):
         assert torch.equal(here, there.cpu())
 
