@@ -74,9 +74,8 @@ def test_what_ends_at_no_cut_is_truncated_and_partial_takes_what_is_whole(capsys
         assert f"packet 2 ({cuts[1]['bytes']:,} bytes): --partial" in error
     whole = told(capsys, "decode", PACKETS, "--packets", 2, "--repeats", 0)
     assert told(capsys, "decode", broken, "--partial", "--repeats", 0)["digest"] == whole["digest"]
-    missing, over = (cuts[3]["bytes"] - cuts[2]["bytes"] + 1, cuts[2]["bytes"] - 1 - cuts[1]["bytes"])
-    assert f"its last {missing:,} bytes are missing: 2 of 4 packets are there" in caplog.text
-    assert f"{over:,} bytes behind the last whole packet are left out" in caplog.text
+    missing = cuts[3]["bytes"] - cuts[2]["bytes"] + 1
+    assert f"2 of 4 packets are there, {missing:,} bytes are missing" in caplog.text
     assert "another file than the source" in refused(capsys, "truncate", broken, "--partial", "--out", broken)
     mended = tmp_path / "mended.swz"
     told(capsys, "truncate", broken, "--partial", "--out", mended)
@@ -86,10 +85,10 @@ def test_what_ends_at_no_cut_is_truncated_and_partial_takes_what_is_whole(capsys
 def test_partial_leaves_out_what_follows_the_last_packet(capsys, caplog, tmp_path):
     longer = tmp_path / "longer.swz"
     longer.write_bytes(PACKETS.read_bytes() + b"more")
-    assert "4 bytes follow the last section: the file is damaged; --partial leaves" in refused(capsys, "decode", longer)
+    assert "4 bytes follow the last section" in refused(capsys, "decode", longer)
     whole = told(capsys, "decode", PACKETS, "--repeats", 0)
     assert told(capsys, "decode", longer, "--partial", "--repeats", 0)["digest"] == whole["digest"]
-    assert "longer.swz: 4 bytes behind the last whole packet are left out" in caplog.text
+    assert "longer.swz: 4 of 4 packets are there, 4 bytes behind them are left out" in caplog.text
     assert "missing" not in caplog.text
 
 

@@ -150,11 +150,9 @@ size_options = options(  # of a training; a method takes those that are keys of 
 def _size_of_part(context: click.Context, _parameter: click.Parameter, given: str | None) -> int | None:
     from splatwizard_core.base.values import parse_size
 
-    if given is None:
-        return None
-    if context.params.get("packets") is not None:
+    if given is not None and context.params.get("packets") is not None:
         raise click.UsageError("--packets and a size each choose a cut: give one of them")
-    return parse_size(given)
+    return None if given is None else parse_size(given)
 
 
 def part_options(size: str) -> Sequence[Callable[[F], F]]:

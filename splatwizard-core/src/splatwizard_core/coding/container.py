@@ -24,7 +24,7 @@ from splatwizard_core.base.files import write_atomic
 from splatwizard_core.base.strict_json import dump_strict, load_strict
 from splatwizard_core.base.warned import warn_once
 from splatwizard_core.coding.array_section import pack_array, unpack_array
-from splatwizard_core.coding.cuts import WHOLE, Cut, Prefix, chosen_cut, parse_cuts, told_lost
+from splatwizard_core.coding.cuts import WHOLE, Cut, Prefix, chosen_cut, parse_cuts
 from splatwizard_core.coding.limits import beyond_limit, decoded_limit
 from splatwizard_core.coding.requirements import Requirement, dump_requirements, parse_requirements
 from splatwizard_core.errors import BitstreamError, PluginError, SplatwizardError, UserInputError, no_file
@@ -274,8 +274,6 @@ class ContainerReader:
                 self.packets = chosen_cut(self.cuts, available, start, prefix, self.name)
             except ValueError as error:
                 raise self._damage(str(error)) from error
-            if prefix.partial and prefix.packets is None and (lost := told_lost(self.cuts, available)):
-                warn_once(f"{self.name}: {lost}")
             sections, available, _ = self.cuts[self.packets - 1]
             rows, self.size = rows[:sections], start + available
         payload: dict[str, bytes] = {}
@@ -294,8 +292,7 @@ class ContainerReader:
             payload[key] = part
             available -= length
         if available:
-            advice = "; --partial leaves them out" if self.cuts else ""
-            raise self._damage(f"{available:,} bytes follow the last section: the file is damaged{advice}")
+            raise self._damage(f"{available:,} bytes follow the last section: the file is damaged")
         return payload
 
     def _rows(self, table: list[Any]) -> list[tuple[str, int, int]]:

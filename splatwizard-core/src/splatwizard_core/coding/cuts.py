@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from splatwizard_core.base.warned import warn_once
 from splatwizard_core.errors import UserInputError
 
 
@@ -77,20 +78,13 @@ def chosen_cut(cuts: Sequence[Cut], length: int, header: int, prefix: Prefix, na
         advice = f"the longest cut that is whole is packet {there} ({ends[there - 1]:,} bytes): --partial decodes it"
         advice = advice if there else f"the first cut is at {ends[0]:,} bytes"
         raise ValueError(f"{header + length:,} bytes end at no declared cut: the file is truncated; {advice}")
+    if prefix.partial and (lost := cuts[-1].bytes - length):
+        end = f"{lost:,} bytes are missing" if lost > 0 else f"{-lost:,} bytes behind them are left out"
+        warn_once(f"{name}: {there} of {len(cuts)} packets are there, {end}")
     if prefix.packets is not None and prefix.packets > there:
         raise UserInputError(f"{name}: it has {there} packets, {prefix.packets} are asked for")
-    found = there if prefix.packets is None else prefix.packets
-    if prefix.bytes is not None:
-        found = min(found, sum(end <= prefix.bytes for end in ends))
+    fits = there if prefix.bytes is None else sum(end <= prefix.bytes for end in ends[:there])
+    found = fits if prefix.packets is None else min(fits, prefix.packets)
     if found < 1:
         raise UserInputError(f"{name}: its first packet ends at {ends[0]:,} bytes, less is no scene")
     return found
-
-
-def told_lost(cuts: Sequence[Cut], length: int) -> str:
-    """Return what a file lacks that has `length` bytes behind its header, and what of it is of no use; "": nothing."""
-    there = sum(cut.bytes <= length for cut in cuts)
-    missing, over = cuts[-1].bytes - length, length - cuts[there - 1].bytes
-    told = [f"its last {missing:,} bytes are missing: {there} of {len(cuts)} packets are there"] if missing > 0 else []
-    told += [f"{over:,} bytes behind the last whole packet are left out"] if over else []
-    return "; ".join(told)
