@@ -1,7 +1,7 @@
 """Build the WebAssembly decoder of .swz files that sw-view ships, from the kernels of the CPU libraries.
 
     pip install ziglang==0.17.1
-    python tools/build_decoder.py            # writes decoder.wasm, anchors.wasm, exact_tables.zlib, build.json
+    python tools/build_decoder.py            # writes the modules, exact_tables.zlib, build.json
     python tools/build_decoder.py --check    # exits with 1 if a build here gives other bytes
 
 `build.json` holds the command, the version of the compiler, and SHA-256 of the sources and of the module, so that a
@@ -50,15 +50,17 @@ KERNELS_OF_ALL = ("octree.cpp", "network.cpp", "sessions.cpp")
 KERNELS_OF_ANCHORS = (
     "bits.cpp", "streams.cpp", "lattice.cpp", "lookups.cpp", "mixtures.cpp", "mixture_rows.cpp", "planes.cpp",
 )  # fmt: skip
-MODULES = ("decoder.wasm", "anchors.wasm")
-"""What is built: explicit Gaussians and wisp; anchor methods."""
+MODULES = ("decoder.wasm", "codebooks.wasm", "anchors.wasm")
+"""What is built: explicit Gaussians and wisp; those that share colours or shapes; anchor methods."""
 
 
 def sources(module: str) -> list[Path]:
     """Return what a module is compiled from, relative to the repository."""
     kernels = [KERNELS / name for name in KERNELS_OF_ALL]
+    shared = [FOLDER / "source" / name for name in OF_ALL]
+    if module == "codebooks.wasm":
+        return [*shared, *_sources_in("source/codebooks"), *kernels]
     if module == "anchors.wasm":
-        shared = [FOLDER / "source" / name for name in OF_ALL]
         kernels += [*(KERNELS / name for name in KERNELS_OF_ANCHORS), ANCHORS / "sw_anchors" / "kernels" / "heads.cpp"]
         return [*shared, *_sources_in("source/anchors"), *kernels]
     return [*_sources_in("source"), *kernels, KERNELS / "leaf_octree.cpp", WISP / "exact_kernels" / "pyramid.cpp"]

@@ -17,6 +17,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -28,9 +29,9 @@ from headless_chromium import WEBGL, Chromium, find_chromium
 from PIL import Image
 from sw_anchors.anchors import AnchorSplats
 from sw_gaussians.surfels import as_ellipsoids
-from sw_view.coded_file import OF_ANCHORS, covers
+from sw_view.coded_file import covers, module_of
 
-from splatwizard_core.api import SH_C0, Camera
+from splatwizard_core.api import SH_C0, Camera, GaussianModel, SplatModel
 from splatwizard_core.coding.container import ContainerReader
 from splatwizard_core.coding.cuts import Prefix
 from splatwizard_core.errors import BitstreamError
@@ -64,6 +65,16 @@ def expected() -> list[tuple[str | None, str | None]]:
     return [told(path.read_bytes()) for path in COVERED]
 
 
+def module_for(data: bytes) -> str:
+    """The module that knows a file, also of one that is damaged behind its header; any tells what is wrong before that."""
+    length = int.from_bytes(data[6:10], "little")
+    try:
+        header = json.loads(data[10 : 10 + length])
+        return module_of(SimpleNamespace(method=header["method"], static=header["static"]))
+    except (ValueError, KeyError, TypeError):
+        return "decoder.wasm"
+
+
 class Wasmtime:
     """The module in wasmtime; an instance a file."""
 
@@ -71,18 +82,14 @@ class Wasmtime:
         import wasmtime
 
         self.api, self.engine = wasmtime, wasmtime.Engine()
-        names = ("decoder.wasm", "anchors.wasm")
-        self.modules = {name: wasmtime.Module.from_file(self.engine, str(FOLDER / name)) for name in names}
+        self.modules = {path.name: wasmtime.Module.from_file(self.engine, str(path)) for path in FOLDER.glob("*.wasm")}
         self.tables = (FOLDER / "exact_tables.zlib").read_bytes()
 
     def told(self, data: bytes, memory: int = -1, packets: int = 0) -> tuple[str | None, str | None]:
         """Hash or reason; `memory` is the most bytes that the instance may have."""
         store = self.api.Store(self.engine)
         store.set_limits(memory_size=memory)
-        # Also of what is damaged.
-        of_anchors = any(f'"method":"{method}"'.encode() in data[:100] for method in OF_ANCHORS)
-        module = self.modules["anchors.wasm" if of_anchors else "decoder.wasm"]
-        exports = self.api.Instance(store, module, []).exports(store)
+        exports = self.api.Instance(store, self.modules[module_for(data)], []).exports(store)
         exports["_initialize"](store)
 
         def text(at: int) -> str:
@@ -132,7 +139,8 @@ def tampered() -> list[bytes]:
 
 DAMAGED = ("3dgs_r3_v1", "3dgs_exact_v1", "c3dgs_v1", "lightgaussian_ranged_v1", "mesongs_v1", "chimerags_uniform16_v1",
            "3dgs_packets_v1", "wisp_v1", "wisp_none_v1", "hac_exact_v1", "hac_half_v2", "hac_plus_v1",
-           "hac_plus_tiny_v1", "cat_3dgs_refined_v1", "cat_3dgs_refined_v2")  # fmt: skip
+           "hac_plus_tiny_v1", "cat_3dgs_refined_v1", "cat_3dgs_refined_v2", "3dgs_tiles_v1", "compact3dgs_v1",
+           "compact3dgs_one_v1", "compact3dgs_plain_v1", "gsc_quant_v1")  # fmt: skip
 
 
 def damages(data: bytes) -> list[bytes]:
@@ -164,8 +172,8 @@ def test_javascript_gets_the_gaussians_of_the_python_decoder(tmp_path):
     in_node(COVERED, tmp_path)
     for path in COVERED:
         model = decode_model(ContainerReader.open(path), load_plugins())
-        if isinstance(model, AnchorSplats):
-            compare_with_anchors(np.fromfile(tmp_path / path.name, "<f4"), model)
+        if not isinstance(model, GaussianModel):
+            compare_live(np.fromfile(tmp_path / path.name, "<f4"), model)
             continue
         model = as_ellipsoids(model)
         sh = torch.cat([model.sh_dc, model.sh_rest], dim=1)
@@ -176,10 +184,15 @@ def test_javascript_gets_the_gaussians_of_the_python_decoder(tmp_path):
 
 
 @torch.no_grad()
-def compare_with_anchors(found: np.ndarray, model: AnchorSplats) -> None:
-    """Arrays of a file of anchors, as they are seen from the origin."""
+def compare_live(found: np.ndarray, model: SplatModel) -> None:
+    """Arrays of a file whose Gaussians depend on the eye, as they are seen from the origin."""
     camera = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(3), torch.zeros(3))
-    seen = model.decode(camera, torch.arange(model.num_rows))
+    if isinstance(model, AnchorSplats):
+        seen = model.decode(camera, torch.arange(model.num_rows))
+    else:
+        everything = SimpleNamespace(visible_filter=lambda inputs, _: torch.ones(len(inputs.means), dtype=torch.bool))
+        seen = model.gaussians(camera, everything)
+        seen = replace(seen, colors=0.5 + SH_C0 * seen.sh.to_dense()[:, 0], sh=None)
     values = (seen.means, seen.quats, seen.scales, seen.opacities, (seen.colors - 0.5) / SH_C0)
     wanted = np.concatenate([value.numpy().ravel() for value in values])
     np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-5)

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from sw_view.coded_file import OF_ANCHORS, covers
+from sw_view.coded_file import covers, module_of
 from swz_fuzzer import blind
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
@@ -93,10 +93,10 @@ def files() -> Iterator[dict[str, tuple[bytes, str]]]:
     object.__setattr__(exact_tables(), "crc", 0)
     try:
         with blind():
-            for name, case in golden.CASES.items():
-                data = golden.encoded(name) if case[0] != "compact3dgs" else b""
-                if data and covers(ContainerReader(data)):
-                    found[name] = data, "anchors.wasm" if case[0] in OF_ANCHORS else "decoder.wasm"
+            for name in golden.CASES:
+                data = golden.encoded(name)
+                if covers(reader := ContainerReader(data)):
+                    found[name] = data, module_of(reader)
             yield found
     finally:
         object.__setattr__(exact_tables(), "crc", crc)

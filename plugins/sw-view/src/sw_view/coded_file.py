@@ -1,7 +1,7 @@
 """The encoded file in the page: decoded there by the WebAssembly module of splatwizard-decoder, if it knows the file.
 
 The page then holds the file as it is, and its decoder (about 100 kB of text, with exact tables 220), in place of
-Gaussians packed for the GPU. Gaussians of anchors are computed in the page for each place that its eye rests at.
+Gaussians packed for the GPU. Gaussians that depend on the eye are computed in the page for each place that it rests at.
 """
 
 from __future__ import annotations
@@ -15,29 +15,36 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
-from splatwizard_core.api import BitstreamError, Camera, ContainerReader, GaussianModel, SplatModel
+from splatwizard_core.api import BitstreamError, Camera, ContainerReader, GaussianInputs, GaussianModel, SplatModel
 from sw_view.packing import Packed, ranges_of
 
 FOLDER = Path(str(files("sw_view"))) / "splatwizard-decoder"
 
 METHODS = (
     "3dgs", "pruned-3dgs", "trimming-the-fat", "pup-3dgs", "speedy-splat", "lightgaussian", "2dgs", "flat-3dgs",
-    "trim-3dgs", "trim-2dgs", "trim-2dgs-scratch", "c3dgs", "mesongs",
+    "trim-3dgs", "trim-2dgs", "trim-2dgs-scratch", "c3dgs", "mesongs", "gsc-quant",
 )  # fmt: skip
 """Methods whose files the decoder knows (source/decode.cpp), where they are in one of CODECS."""
+CODECS_OF_CODEBOOKS = ("vectree", "gaussians-indexed", "raht", "gsc-quant")
+"""Those that codebooks.wasm knows."""
 CODECS = (
-    "gaussians-exact", "gaussians-quantized", "gaussians-zstd", "gaussians-ply", "vectree", "gaussians-indexed", "raht",
-)  # fmt: skip
+    "gaussians-exact", "gaussians-quantized", "gaussians-tiles", "gaussians-zstd", "gaussians-ply", *CODECS_OF_CODEBOOKS
+)
 OF_ANCHORS = ("hac", "hac-plus", "cat-3dgs")
 """Methods whose files anchors.wasm knows, in mode `exact`."""
 WITH_TABLES = ("wisp", *OF_ANCHORS)
 """Methods whose files are decoded by the exact tables (module.js)."""
+FIELD = "compact3dgs"
+"""The method whose colours a field has."""
+LIVE = (FIELD, *OF_ANCHORS)
+"""Methods whose Gaussians depend on where they are seen from: a page computes them wherever the eye rests."""
 MODES = ("exact", "quantized")
 """Of `3dgs`, in place of a codec."""
 PARTS = {
     "entropy": ("columns",), "positions": ("octree",), "means": ("float-delta",), "arrays": ("byte-planes", "deflate"),
-    "vq": ("importance-vq",),
+    "vq": ("importance-vq",), "coder": ("huffman", "range", "rans"),
 }  # fmt: skip
 """Header value -> what it may name: a file may ask for parts of others, which the decoder lacks."""
 MOST_PLACES = 8
@@ -55,7 +62,7 @@ def covers(reader: ContainerReader) -> bool:
         return False
     if reader.method in OF_ANCHORS:
         return static.get("mode") == "exact"
-    if reader.method in ("chimerags", "wisp"):
+    if reader.method in ("chimerags", FIELD, "wisp"):
         return True
     codec, mode = static.get("codec"), static.get("mode")
     return reader.method in METHODS and (
@@ -63,40 +70,56 @@ def covers(reader: ContainerReader) -> bool:
     )
 
 
+def module_of(reader: ContainerReader) -> str:
+    """Return the name of the WebAssembly module that knows a file."""
+    if reader.method in OF_ANCHORS:
+        return "anchors.wasm"
+    of_codebooks = reader.method in ("chimerags", FIELD) or reader.static.get("codec") in CODECS_OF_CODEBOOKS
+    return "codebooks.wasm" if of_codebooks else "decoder.wasm"
+
+
 def with_file(model: SplatModel, packed: Packed) -> Packed:
     """Return what a page holds of a model: the file that it was decoded from, if that is smaller; else `packed`."""
     found = _file_of(model)
     if found is None:
         return packed
-    data, method = found
-    text, decoder = base64.b64encode(data).decode("ascii"), _decoder(has_tables=method in WITH_TABLES)
+    data, reader = found
+    text, decoder = base64.b64encode(data).decode("ascii"), _decoder(reader)
     if len(text) + len(decoder) >= len(packed.text):
         return packed
     return Packed(text, {**packed.facts, "reach": packed.reach}, packed.means, packed.reach, decoder)
 
 
-def with_anchors(model: SplatModel, path: Path, cameras: Sequence[Camera]) -> Packed | None:
-    """Return what a page holds of anchors: their file, of which it computes Gaussians wherever the eye rests.
+def with_live(model: SplatModel, path: Path, cameras: Sequence[Camera]) -> Packed | None:
+    """Return what a page holds of Gaussians that depend on the eye: their file, of which it computes them at each rest.
 
     path        of the file that the model was decoded from
-    cameras     places from which the ranges of its numbers are taken
+    cameras     places from which the ranges of the numbers of anchors are taken
 
     None for other models and for files that the decoder does not know. Raises SceneError if no camera sees any.
     """
-    spawn = getattr(model, "decode", None)
-    if spawn is None or path.suffix != ".swz":
+    if isinstance(model, GaussianModel) or path.suffix != ".swz":
         return None
     reader = ContainerReader.open(path)
-    if reader.method not in OF_ANCHORS or not covers(reader):
+    if reader.method not in LIVE or not covers(reader):
         return None
     positions = getattr(model, model.ROWS[0]).detach()
-    with torch.no_grad():
-        rows = torch.arange(len(positions), device=positions.device)
-        seen = [spawn(camera.to(positions.device), rows) for camera in _some(cameras)]
-    facts, reach = ranges_of(seen)
-    facts |= {"count": int(reader.static["num_gaussians"]), "anchors": len(positions), "reach": reach}
+    facts, reach = ranges_of(_seen(model, positions, cameras))
+    facts |= {"count": int(reader.static["num_gaussians"]), "live": 1, "reach": reach}
+    if reader.method in OF_ANCHORS:
+        facts["anchors"] = len(positions)
     text = base64.b64encode(path.read_bytes()).decode("ascii")
-    return Packed(text, facts, positions.float().cpu().numpy(), reach, _decoder("anchors.wasm", has_tables=True))
+    return Packed(text, facts, positions.float().cpu().numpy(), reach, _decoder(reader))
+
+
+@torch.no_grad()
+def _seen(model: Any, positions: Tensor, cameras: Sequence[Camera]) -> list[GaussianInputs]:
+    """Return what some cameras see of anchors; other Gaussians change nothing but their colours."""
+    spawn = getattr(model, "decode", None)
+    if spawn is None:
+        return [GaussianInputs(positions, model.opacities, scales=model.scales, quats=model.quats, colors=positions)]
+    rows = torch.arange(len(positions), device=positions.device)
+    return [spawn(camera.to(positions.device), rows) for camera in _some(cameras)]
 
 
 def _some(cameras: Sequence[Camera]) -> list[Camera]:
@@ -105,8 +128,8 @@ def _some(cameras: Sequence[Camera]) -> list[Camera]:
     return list(cameras[::step])
 
 
-def _file_of(model: SplatModel) -> tuple[bytes, str] | None:
-    """Return the .swz that a model was decoded from and its method, if the page can decode it to the same Gaussians."""
+def _file_of(model: SplatModel) -> tuple[bytes, ContainerReader] | None:
+    """Return the .swz that a model was decoded from and its header, if the page can decode it to the same Gaussians."""
     origin = model.origin if isinstance(model, GaussianModel) else {}
     path = Path(str(origin.get("file", "")))
     if path.suffix != ".swz":
@@ -121,7 +144,7 @@ def _file_of(model: SplatModel) -> tuple[bytes, str] | None:
     if not covers(reader):
         return None
     same = _count(reader) == model.num_rows + sum(origin.get("left_out", {}).values())
-    return (data, reader.method) if same and not moved else None
+    return (data, reader) if same and not moved else None
 
 
 def _count(reader: ContainerReader) -> Any:
@@ -131,9 +154,14 @@ def _count(reader: ContainerReader) -> Any:
     return reader.static.get("num_gaussians")
 
 
+def _decoder(reader: ContainerReader) -> str:
+    """Return the elements of the page with the decoder of a file."""
+    return _elements(module_of(reader), has_tables=reader.method in WITH_TABLES)
+
+
 @cache
-def _decoder(module: str = "decoder.wasm", *, has_tables: bool = False) -> str:
-    """Return the elements of the page with the decoder: a script for a worker, a module, and tables, deflated."""
+def _elements(module: str, *, has_tables: bool) -> str:
+    """Return a script for a worker, a module, and tables, deflated."""
     parts = {"wasm": zlib.compress((FOLDER / module).read_bytes(), 9)}
     if has_tables:
         parts["tables"] = (FOLDER / "exact_tables.zlib").read_bytes()

@@ -20,7 +20,7 @@ from splatwizard_core.api import (
     UserInputError,
 )
 from splatwizard_core.tooling import Choices, NegotiatedRasterizer, bytes_with_named, open_session, open_subject
-from sw_view.coded_file import with_anchors
+from sw_view.coded_file import with_live
 from sw_view.drawing import Drawing
 from sw_view.packing import Packed, solid_means
 from sw_view.page_file import LIVE, MADE_UP, About
@@ -120,9 +120,9 @@ def for_page(opened: Opened) -> tuple[SplatModel | Packed, str]:
     training cameras of the scene, if there is one.
     """
     drawing = opened.drawing
-    anchors = with_anchors(drawing.model, opened.entry.file, [each.camera for each in opened.around.cameras])
-    if anchors is not None:
-        return anchors, LIVE if opened.has_scene else f"{LIVE} {MADE_UP}"
+    live = with_live(drawing.model, opened.entry.file, [each.camera for each in opened.around.cameras])
+    if live is not None:
+        return live, LIVE if opened.has_scene else f"{LIVE} {MADE_UP}"
     if isinstance(drawing.model, GaussianModel) or not opened.has_scene:
         return drawing.model, "" if opened.has_scene else MADE_UP
     cameras = [view.camera for view in drawing.scene.train]

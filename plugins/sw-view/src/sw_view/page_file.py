@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from sw_gaussians.render_options import antialias_of, eps2d_of
 
 from splatwizard_core.api import Camera, GaussianModel, SplatModel, replacing
-from sw_view.coded_file import with_anchors, with_file
+from sw_view.coded_file import with_file, with_live
 from sw_view.packing import Packed, pack
 from sw_view.shown_cameras import NamedCamera, Surroundings, surroundings_about
 
@@ -107,8 +107,8 @@ def export_page(model: SplatModel, path: str | os.PathLike[str]) -> None:
         write_page(model, path, about, None)
         return
     around = surroundings_about(getattr(model, model.ROWS[0]).detach().float().cpu().numpy()[:, :3])
-    anchors = with_anchors(model, Path(str(model.origin.get("file", ""))), [each.camera for each in around.cameras])
-    write_page(anchors or model, path, replace(about, note=f"{LIVE} {MADE_UP}"), around)
+    live = with_live(model, Path(str(model.origin.get("file", ""))), [each.camera for each in around.cameras])
+    write_page(live or model, path, replace(about, note=f"{LIVE} {MADE_UP}"), around)
 
 
 def _page(packed: Packed, about: About, around: Surroundings) -> str:

@@ -48,7 +48,7 @@ function forGpu(arrays, facts) {
   return { means, words, harmonics: new Uint32Array(harmonics.buffer), texels };
 }
 
-let held = null;  // anchors, and the facts of their page
+let held = null;  // a file whose Gaussians depend on the eye, and the facts of its page
 
 function tell(arrays, facts, eye, whole) {
   const found = forGpu(arrays, facts);
@@ -62,8 +62,8 @@ self.onmessage = async ({ data: { wasm, file, tables, facts, coarse, eye } }) =>
       return;
     }
     const module = await WebAssembly.compile(wasm);
-    if (facts.anchors) {
-      held = { facts, ...anchors(module, file, { tables }) };
+    if (facts.live) {
+      held = { facts, ...live(module, file, { tables }) };
       tell(held.seen(eye), facts, eye, true);
       return;
     }

@@ -11,13 +11,13 @@ async function unpacked(text) {
 }
 
 // Tells of what the page holds, the encoded file and its decoder (coded.js) or Gaussians as they are drawn: of the first
-// cut of a file with cuts, if that is asked for, then of all. Gaussians of anchors are those that are seen from `eye`, and
+// cut of a file with cuts, if that is asked for, then of all. Gaussians that depend on the eye are those that are seen from `eye`, and
 // `look` asks for those of another place.
 async function eachGaussians({ gaussians, decoder, wasm, tables }, facts, coarse, eye, tell) {
   const text = gaussians.textContent;
   if (!decoder) return tell(gaussiansFrom(await unpacked(text), facts), { whole: true });
   const worker = new Worker(URL.createObjectURL(new Blob([decoder.textContent], { type: 'text/javascript' })));
-  const look = facts.anchors ? place => worker.postMessage({ eye: place }) : null;
+  const look = facts.live ? place => worker.postMessage({ eye: place }) : null;
   const module = await unpacked(wasm.textContent);
   return new Promise((resolve, reject) => {
     worker.onerror = reject;

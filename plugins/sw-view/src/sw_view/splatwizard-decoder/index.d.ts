@@ -41,7 +41,7 @@ export interface Options {
   packets?: number;
   /** Called with coarser Gaussians of a file with cuts, before it is whole: while a Response arrives, else for its first cut. */
   onCut?: (coarse: Gaussians) => void;
-  /** Of a file of anchors, the place [x, y, z] that its Gaussians are seen from; the default is the origin. */
+  /** Where Gaussians depend on the eye, the place [x, y, z] that its Gaussians are seen from; the default is the origin. */
   eye?: [number, number, number];
   /** Whether to compute the hash of the decoded parameters. */
   hash?: boolean;
@@ -58,8 +58,11 @@ export class DecodeError extends Error {
 /** Decodes a file. Rejects with DecodeError for one that is damaged, or that needs more than this decoder knows. */
 export function decode(source: Uint8Array | ArrayBuffer | Response | Blob, options?: Options): Promise<Gaussians>;
 
-/** Anchors of a file of `hac`, `hac-plus` or `cat-3dgs`: they spawn other Gaussians for each place to look from. */
-export interface Anchors {
+/**
+ * A file whose Gaussians depend on the place to look from: anchors of `hac`, `hac-plus` and `cat-3dgs` spawn others, in
+ * `compact3dgs` a field has their colours.
+ */
+export interface Live {
   /** The header of the file. */
   meta: Header;
   /** SHA-256 of the decoded parameters, if it was asked for. */
@@ -70,10 +73,10 @@ export interface Anchors {
   close(): void;
 }
 
-/** Decodes a file of anchors, and stays to be asked what is seen from where. Rejects as `decode` does. */
-export function anchors(
+/** Decodes such a file, and stays to be asked what is seen from where. Rejects as `decode` does. */
+export function live(
   source: Uint8Array | ArrayBuffer | Response | Blob, options?: Pick<Options, 'signal' | 'hash' | 'worker'>,
-): Promise<Anchors>;
+): Promise<Live>;
 
 /** The header of a file, unchecked but for its form. */
 export function info(bytes: Uint8Array): Header;

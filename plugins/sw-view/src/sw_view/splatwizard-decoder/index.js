@@ -1,5 +1,5 @@
 // splatwizard-decoder: .swz files in browsers and Node. See index.d.ts for the types.
-import { anchors as anchorsOf, cutEnds, DecodeError, decodedGaussians, gaussians, info, moduleOf, needsTables } from './module.js';
+import { cutEnds, DecodeError, decodedGaussians, gaussians, info, live as liveOf, moduleOf, needsTables } from './module.js';
 
 export { DecodeError, info };
 
@@ -58,12 +58,12 @@ function startWorker(signal) {
 
 const hasWorkers = typeof Worker !== 'undefined';
 
-export async function anchors(source, { signal, hash = false, worker = hasWorkers } = {}) {
+export async function live(source, { signal, hash = false, worker = hasWorkers } = {}) {
   signal?.throwIfAborted();
-  const bytes = await bytesOf(source), module = await compiled('./anchors.wasm'), options = { hash, tables: await ownTables(bytes) };
+  const bytes = await bytesOf(source), module = await compiled(`./${moduleOf(bytes)}`), options = { hash, tables: await ownTables(bytes) };
   const meta = info(bytes);
   if (!worker) {
-    const held = anchorsOf(module, bytes, options);
+    const held = liveOf(module, bytes, options);
     return { meta, hash: held.hash, from: async eye => gaussians(bytes, { arrays: held.seen(eye), hash: held.hash }), close() {} };
   }
   const { ask, end } = startWorker(signal);

@@ -32,25 +32,30 @@ export function cutEnds(bytes) {
   return (info(bytes).cuts ?? []).map(([, end]) => 14 + view.getUint32(6, true) + end);
 }
 
-const OF_ANCHORS = ['hac', 'hac-plus', 'cat-3dgs'], WITH_TABLES = ['wisp', ...OF_ANCHORS];
+const OF_ANCHORS = ['hac', 'hac-plus', 'cat-3dgs'], WITH_TABLES = ['wisp', ...OF_ANCHORS], LIVE = ['compact3dgs', ...OF_ANCHORS];
+const OF_CODEBOOKS = ['chimerags', 'compact3dgs'], CODECS_OF_CODEBOOKS = ['vectree', 'gaussians-indexed', 'raht', 'gsc-quant'];
 
-// Null for what is no file: the decoder then says why.
-function methodOf(bytes) {
+// Of what is no file {}: the decoder then says why.
+function headerOf(bytes) {
   try {
-    return info(bytes).method;
+    return info(bytes);
   } catch {
-    return null;
+    return {};
   }
 }
 
-/** Whether a file holds anchors, whose Gaussians depend on where they are seen from. */
-export function hasAnchors(bytes) { return OF_ANCHORS.includes(methodOf(bytes)); }
+/** Whether the Gaussians of a file depend on where they are seen from: anchors spawn them, or a field has their colours. */
+export function isLive(bytes) { return LIVE.includes(headerOf(bytes).method); }
 
 /** Name of the WebAssembly module that knows a file. */
-export function moduleOf(bytes) { return hasAnchors(bytes) ? 'anchors.wasm' : 'decoder.wasm'; }
+export function moduleOf(bytes) {
+  const { method, static: values } = headerOf(bytes);
+  if (OF_ANCHORS.includes(method)) return 'anchors.wasm';
+  return OF_CODEBOOKS.includes(method) || CODECS_OF_CODEBOOKS.includes(values?.codec) ? 'codebooks.wasm' : 'decoder.wasm';
+}
 
 /** Whether a file is decoded by the exact tables, exact_tables.zlib. */
-export function needsTables(bytes) { return WITH_TABLES.includes(methodOf(bytes)); }
+export function needsTables(bytes) { return WITH_TABLES.includes(headerOf(bytes).method); }
 
 // An instance of a module that has decoded a file, and what reads its memory.
 function decodedBy(module, bytes, packets, tables) {
@@ -96,10 +101,10 @@ export function parameters(module, bytes, { hash = false, packets = 0, tables = 
 }
 
 /**
- * The anchors in a file: `seen(eye)` gives the raw parameters of the Gaussians that they spawn for a place [x, y, z], as
- * `parameters` has those of others. An instance of anchors.wasm lives as long as this.
+ * A file whose Gaussians depend on the eye: `seen(eye)` gives the raw parameters of those that are seen from a place
+ * [x, y, z], as `parameters` has those of others. An instance of the module lives as long as this.
  */
-export function anchors(module, bytes, { hash = false, tables = null } = {}) {
+export function live(module, bytes, { hash = false, tables = null } = {}) {
   const { exports, text, guarded } = decodedBy(module, bytes, 0, tables);
   const seen = eye => {
     const count = guarded(() => exports.swz_see(...eye));
@@ -149,10 +154,10 @@ export function plain(arrays) {
 
 const SURFEL_THICKNESS = 1e-8;  // world units, as `sw export` gives surfels a third axis
 
-/** Gaussians of a file as a renderer wants them; of anchors those that are seen from `eye`. */
+/** Gaussians of a file as a renderer wants them; where they depend on the eye those that are seen from `eye`. */
 export function decodedGaussians(module, bytes, options) {
-  if (!hasAnchors(bytes)) return gaussians(bytes, parameters(module, bytes, options));
-  const { seen, hash } = anchors(module, bytes, options);
+  if (!isLive(bytes)) return gaussians(bytes, parameters(module, bytes, options));
+  const { seen, hash } = live(module, bytes, options);
   return gaussians(bytes, { arrays: seen(options.eye), hash });
 }
 

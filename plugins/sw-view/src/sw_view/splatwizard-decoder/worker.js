@@ -1,12 +1,12 @@
-// Decodes one file in a thread of its own; of anchors, tells what is seen from each place that it is then sent.
-import { anchors, decodedGaussians, gaussians } from './module.js';
+// Decodes one file in a thread of its own; of one whose Gaussians depend on the eye, tells what is seen from each place that it is then sent.
+import { decodedGaussians, gaussians, live } from './module.js';
 
 let held = null;
 
 self.onmessage = ({ data: { module, bytes, options, stays, eye } }) => {
   try {
     if (stays) {
-      held = { bytes, ...anchors(module, bytes, options) };
+      held = { bytes, ...live(module, bytes, options) };
       self.postMessage({ found: { hash: held.hash } });
       return;
     }

@@ -4,7 +4,7 @@
 
 namespace swz {
 
-enum Dtype : uint8_t { INT32 = 6, FLOAT32 = 10, FLOAT64 = 11 };  // their codes in a file
+enum Dtype : uint8_t { INT32 = 6, FLOAT16 = 9, FLOAT32 = 10, FLOAT64 = 11 };  // their codes in a file
 
 constexpr int64_t FREE = 1 << 24, EXPANSION = 256;  // bytes of a model: always, and for each byte of its sections
 

@@ -8,6 +8,7 @@
 #include "gaussian_files.h"
 #include "model.h"
 #include "points.h"
+#include "quantized.h"
 
 namespace swz {
 
@@ -22,14 +23,6 @@ constexpr const char* KEYS[] = {"num_gaussians", "max_sh_degree", "active_sh_deg
                                 "width", "top", "dc_step", "rest_step", "opacity_step", "scale_step", "quat_step",
                                 "sh_classes", "precision", "sh_basis", "primitive", "packets"};
 
-struct Layout {
-  int64_t count, degree, active, bits, classes, scales;
-  double center[3], width[3], top[3];
-  double dc_step, rest_step, opacity_step, scale_step, quat_step;
-  bool precision;         // rows have classes of it
-  const int8_t* basis;    // of SH bands 1 to 3; null: the usual one
-};
-
 constexpr int MOST_PRECISION = 4;
 constexpr double BASIS_UNIT = 127;
 
@@ -41,6 +34,8 @@ struct Packets {
   double swell = 0;  // what the last of them adds to log scales
 };
 
+}  // namespace
+
 [[noreturn]] void wrong(const char* key, const char* reason) { refuse("header value '", key, "': ", reason); }
 
 const Json* stated(const Container& file, const char* key) {
@@ -49,7 +44,7 @@ const Json* stated(const Container& file, const char* key) {
   return found;
 }
 
-int64_t integer(const Container& file, const char* key, int64_t low, int64_t high) {
+int64_t stated_integer(const Container& file, const char* key, int64_t low, int64_t high) {
   const Json* found = stated(file, key);
   if (found->kind != Json::INTEGER) wrong(key, "Input should be a valid integer");
   if (found->integer < low)
@@ -60,6 +55,8 @@ int64_t integer(const Container& file, const char* key, int64_t low, int64_t hig
   }
   return found->integer;
 }
+
+namespace {
 
 double step(const Container& file, const char* key) {
   const Json* found = stated(file, key);
@@ -119,43 +116,46 @@ Packets packets_of(const Container& file, int64_t gaussians) {
   return found;
 }
 
-Layout layout_of(const Container& file) {
-  Layout found;
-  found.count = integer(file, "num_gaussians", 0, UINT32_MAX);
-  found.degree = integer(file, "max_sh_degree", 0, 3);
-  found.active = integer(file, "active_sh_degree", 0, 3);
-  found.bits = integer(file, "position_bits", 1, 21);
-  three(file, "center", false, found.center);
-  three(file, "width", false, found.width);
-  three(file, "top", true, found.top);
-  found.dc_step = step(file, "dc_step");
-  found.rest_step = step(file, "rest_step");
-  found.opacity_step = step(file, "opacity_step");
-  found.scale_step = step(file, "scale_step");
-  found.quat_step = step(file, "quat_step");
-  found.classes = integer(file, "sh_classes", 1, 16);
-  found.precision = flag(file, "precision");
-  found.basis = nullptr;
+}  // namespace
+
+Layout::Layout(const Container& file, std::initializer_list<const char*> further) {
+  count = stated_integer(file, "num_gaussians", 0, UINT32_MAX);
+  degree = stated_integer(file, "max_sh_degree", 0, 3);
+  active = stated_integer(file, "active_sh_degree", 0, 3);
+  bits = stated_integer(file, "position_bits", 1, 21);
+  three(file, "center", false, center);
+  three(file, "width", false, width);
+  three(file, "top", true, top);
+  dc_step = step(file, "dc_step");
+  rest_step = step(file, "rest_step");
+  opacity_step = step(file, "opacity_step");
+  scale_step = step(file, "scale_step");
+  quat_step = step(file, "quat_step");
+  classes = stated_integer(file, "sh_classes", 1, 16);
+  precision = flag(file, "precision");
+  basis = nullptr;
   const Json* primitive = file.value("primitive");
   if (primitive != nullptr && primitive->kind != Json::NOTHING && !primitive->is("surfel"))
     wrong("primitive", "Input should be 'surfel'");
-  found.scales = primitive != nullptr && primitive->kind == Json::STRING ? 2 : 3;
+  scales = primitive != nullptr && primitive->kind == Json::STRING ? 2 : 3;
   for (const Json* key = file.header->find("static")->first; key != nullptr; key = key->next) {
     const auto same = [&](const char* name) { return std::strcmp(name, key->key) == 0; };
-    if (std::none_of(BESIDE, std::end(BESIDE), same) && std::none_of(KEYS, std::end(KEYS), same))
+    if (std::none_of(BESIDE, std::end(BESIDE), same) && std::none_of(KEYS, std::end(KEYS), same) &&
+        std::none_of(further.begin(), further.end(), same))
       wrong(key->key, "Extra inputs are not permitted");
   }
   file.usual("entropy", "columns");
   file.usual("positions", "octree");
-  return found;
 }
 
-void check_grid(const Layout& layout) {
-  if (layout.active > layout.degree) refuse("header activates more SH bands than there are");
+void Layout::check() const {
+  if (active > degree) refuse("header activates more SH bands than there are");
   for (int axis = 0; axis < 3; ++axis)
-    if (!(layout.width[axis] > 0 && layout.width[axis] < 1e30 && layout.top[axis] >= 1 && layout.top[axis] <= 40))
+    if (!(width[axis] > 0 && width[axis] < 1e30 && top[axis] >= 1 && top[axis] <= 40))
       refuse("header describes no usable position grid");
 }
+
+namespace {
 
 // The coordinate of a cell on an axis.
 double coordinate(const Layout& layout, int axis, int64_t cell) {
@@ -342,7 +342,8 @@ void put_classes(Bytes data, const Buffer<int64_t>& values, int64_t count, int64
   }
 }
 
-// The rows of one packet, whose sections have this prefix; `to` begins with the first of them.
+}  // namespace
+
 void decode_rows(Container& file, const Layout& layout, const char* prefix, Gaussians to) {
   const int64_t n = layout.count;
   const auto section_of = [&](const char* name, const auto& decode) {
@@ -408,15 +409,13 @@ void decode_rows(Container& file, const Layout& layout, const char* prefix, Gaus
   if (layout.basis != nullptr) from_basis(layout, steps, to);
 }
 
-}  // namespace
-
 void decode_quantized(Container& file) {
-  Layout layout = layout_of(file);
+  Layout layout(file);
   const Packets packets = packets_of(file, layout.count);
-  check_grid(layout);
+  layout.check();
   int64_t n = 0;
   for (int64_t i = 0; i < packets.count; ++i) n += packets.rows[i];
-  file.allow(4 * n * (8 + layout.scales + 3 * (layout.degree + 1) * (layout.degree + 1)), n);
+  file.allow(layout.decoded_bytes(n), n);
   if (flag(file, "sh_basis")) {
     const Bytes data = file.section("basis");
     const Blame blame("basis");
