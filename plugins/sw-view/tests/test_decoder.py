@@ -5,43 +5,37 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
-import http.server
 import importlib.util
 import json
 import re
 import shutil
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import sw_view
 import torch
-from headless_chromium import WEBGL, Chromium, find_chromium
+from decoder_engines import SCRIPT, Wasmtime, in_chromium, in_node, in_python, opened, served
+from headless_chromium import find_chromium
 from PIL import Image
 from sw_anchors.anchors import AnchorSplats
 from sw_gaussians.surfels import as_ellipsoids
-from sw_view.coded_file import covers, module_of
+from sw_view.coded_file import covers
 
 from splatwizard_core.api import SH_C0, Camera, GaussianModel, SplatModel
 from splatwizard_core.coding.container import ContainerReader
 from splatwizard_core.coding.cuts import Prefix
-from splatwizard_core.errors import BitstreamError
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.runs.decode import decode_model
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[3]
 THREE = ROOT / "build" / "three" / "node_modules"
-FOLDER = Path(sw_view.__file__).parent / "splatwizard-decoder"
 GOLDEN = sorted((ROOT / "tests" / "golden").glob("*.swz"))
 PACKETS = ROOT / "tests" / "golden" / "3dgs_packets_v1.swz"
 COVERED = [path for path in GOLDEN if covers(ContainerReader.open(path))]
@@ -52,67 +46,14 @@ needs_ziglang = pytest.mark.skipif(importlib.util.find_spec("ziglang") is None, 
 needs_chromium = pytest.mark.skipif(find_chromium() is None, reason="no Chromium is installed")
 
 
-def told(data: bytes, name: str = "file") -> tuple[str | None, str | None]:
-    """Hash, or reason, as the Python decoder has it."""
-    try:
-        return decode_model(ContainerReader(data, name), load_plugins()).parameter_hash(), None
-    except BitstreamError as error:
-        return None, str(error).removeprefix(f"{name}: ")
-
-
 @functools.cache
 def expected() -> list[tuple[str | None, str | None]]:
-    return [told(path.read_bytes()) for path in COVERED]
-
-
-def module_for(data: bytes) -> str:
-    """The module that knows a file, also of one that is damaged behind its header; any tells what is wrong before that."""
-    length = int.from_bytes(data[6:10], "little")
-    try:
-        header = json.loads(data[10 : 10 + length])
-        return module_of(SimpleNamespace(method=header["method"], static=header["static"]))
-    except (ValueError, KeyError, TypeError):
-        return "decoder.wasm"
-
-
-class Wasmtime:
-    """The module in wasmtime; an instance a file."""
-
-    def __init__(self) -> None:
-        import wasmtime
-
-        self.api, self.engine = wasmtime, wasmtime.Engine()
-        self.modules = {path.name: wasmtime.Module.from_file(self.engine, str(path)) for path in FOLDER.glob("*.wasm")}
-        self.tables = (FOLDER / "exact_tables.zlib").read_bytes()
-
-    def told(self, data: bytes, memory: int = -1, packets: int = 0) -> tuple[str | None, str | None]:
-        """Hash or reason; `memory` is the most bytes that the instance may have."""
-        store = self.api.Store(self.engine)
-        store.set_limits(memory_size=memory)
-        exports = self.api.Instance(store, self.modules[module_for(data)], []).exports(store)
-        exports["_initialize"](store)
-
-        def text(at: int) -> str:
-            return bytes(exports["memory"].read(store, at, at + 1024)).partition(b"\0")[0].decode()
-
-        try:
-            exports["memory"].write(store, data, exports["swz_input"](store, len(data)))
-            exports["memory"].write(store, self.tables, exports["swz_tables"](store, len(self.tables)))
-            exports["swz_decode"](store, packets)
-        except self.api.Trap:
-            return None, text(exports["swz_refusal"](store))
-        return text(exports["swz_hash"](store)), None
+    return [in_python(path.read_bytes()) for path in COVERED]
 
 
 @pytest.fixture(scope="module")
 def wasmtime() -> Wasmtime:
     return Wasmtime()
-
-
-def in_node(paths: list[Path], into: Path | None = None) -> list[tuple[str | None, str | None]]:
-    script, options = Path(__file__).with_name("decode_files.mjs"), ["--into", into] if into else []
-    done = subprocess.run(["node", script, *options, *paths], capture_output=True, text=True, check=True)
-    return [tuple(json.loads(line)[:2]) for line in done.stdout.splitlines()]
 
 
 def with_crcs(data: bytes, name: str, change: dict[int, int], **static: object) -> bytes:
@@ -198,46 +139,9 @@ def compare_live(found: np.ndarray, model: SplatModel) -> None:
     np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-5)
 
 
-@contextlib.contextmanager
-def served(folder: Path) -> Iterator[str]:
-    """The package as it is published, the golden files and an empty page over HTTP; the address."""
-    shutil.copytree(FOLDER, folder / "package")
-    (folder / "golden").symlink_to(GOLDEN[0].parent)
-    (folder / "page.html").write_text("<!doctype html><title>decoder</title><link rel=icon href='data:,'>")
-    handler = functools.partial(Quiet, directory=folder)
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{server.server_address[1]}"
-        server.shutdown()
-
-
-class Quiet(http.server.SimpleHTTPRequestHandler):
-    def log_message(self, *_: object) -> None:
-        pass
-
-
-@contextlib.contextmanager
-def opened(address: str, profile: Path) -> Iterator[Chromium]:
-    browser = Chromium(find_chromium(), profile, flags=WEBGL)
-    try:
-        browser.open(SimpleNamespace(resolve=lambda: SimpleNamespace(as_uri=lambda: address)), width=800)
-        yield browser
-    finally:
-        browser.close()
-
-
 @needs_chromium
 def test_chromium_gives_the_hashes_of_the_python_decoder(tmp_path):
-    """In a worker, from the folder as it is published."""
-    names = json.dumps([path.name for path in COVERED])
-    with served(tmp_path) as address, opened(f"{address}/page.html", tmp_path / "profile") as browser:
-        found = browser.ask(f"""(async () => {{
-          const {{ decode }} = await import('/package/index.js');
-          const found = [];
-          for (const name of {names}) found.push(await decode(await fetch('/golden/' + name), {{ hash: true }}));
-          return found.map(each => each.hash);
-        }})()""")
-    assert found == [sha for sha, _ in expected()]
+    assert in_chromium(COVERED, tmp_path) == expected()
 
 
 @needs_chromium
@@ -270,14 +174,14 @@ def test_a_tampered_file_gives_the_same_reason(wasmtime):
         return told[0], of_library.sub("", told[1] or "")
 
     found = [shortened(wasmtime.told(data)) for data in tampered()]
-    assert found == [shortened(told(data)) for data in tampered()]
+    assert found == [shortened(in_python(data)) for data in tampered()]
     assert len({reason for _, reason in found}) > 50
 
 
 @needs_node
 def test_the_reason_reaches_javascript(tmp_path):
     (tmp_path / "x.swz").write_bytes(tampered()[0])
-    assert in_node([tmp_path / "x.swz"]) == [told(tampered()[0])]
+    assert in_node([tmp_path / "x.swz"]) == [in_python(tampered()[0])]
 
 
 @needs_wasmtime
@@ -295,8 +199,7 @@ def test_a_file_with_cuts_is_read_up_to_each_of_them(wasmtime, path):
 
 @needs_node
 def test_javascript_is_shown_the_first_cut_before_the_whole():
-    script = Path(__file__).with_name("decode_files.mjs")
-    done = subprocess.run(["node", script, PACKETS, COVERED[0]], capture_output=True, text=True, check=True)
+    done = subprocess.run(["node", SCRIPT, PACKETS, COVERED[0]], capture_output=True, text=True, check=True)
     (_, _, coarse), whole = (json.loads(line) for line in done.stdout.splitlines())
     first = ContainerReader(PACKETS.read_bytes()).static["packets"][0][0]
     assert coarse == first
@@ -333,7 +236,7 @@ def test_every_rate_point_has_the_hash_of_the_python_decoder(wasmtime):
     files = [data for data in rate_points() if covers(ContainerReader(data))]
     assert len({ContainerReader(data).method for data in files}) >= 13
     assert len(files) > 60
-    assert [wasmtime.told(data) for data in files] == [told(data) for data in files]
+    assert [wasmtime.told(data) for data in files] == [in_python(data) for data in files]
 
 
 @needs_node

@@ -56,11 +56,13 @@ def test_its_package_has_the_version_of_sw_view():
 def test_what_is_no_file_and_what_claims_too_much_is_told_in_a_second(tmp_path):
     """Of each module one file, as it stands on the disk: cut, empty, and with a count that its bytes cannot hold."""
     paths = []
-    for name, key in (("3dgs_r3_v1", "num_gaussians"), ("compact3dgs_v1", "num_gaussians"), ("hac_half_v2", "num_anchors")):
+    for name in ("3dgs_r3_v1", "compact3dgs_v1", "hac_half_v2"):
         data = (GOLDEN / f"{name}.swz").read_bytes()
         reader = ContainerReader(data)
         writer = ContainerWriter(reader.method, reader.version, raster=reader.raster)
-        writer.static.update({**reader.static, key: 1 << 31, "num_gaussians": 1 << 31})
+        writer.static.update({**reader.static, "num_gaussians": 1 << 31})
+        if "num_anchors" in reader.static:
+            writer.static["num_anchors"] = 1 << 31
         for section in reader.sections:
             writer.add(section, reader.section(section))
         for number, content in enumerate((data[:100], data[:-1], b"", writer.to_bytes())):

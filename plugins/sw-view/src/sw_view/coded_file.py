@@ -30,8 +30,9 @@ METHODS = (
 CODECS_OF_CODEBOOKS = ("vectree", "gaussians-indexed", "raht", "gsc-quant")
 """Those that codebooks.wasm knows."""
 CODECS = (
-    "gaussians-exact", "gaussians-quantized", "gaussians-tiles", "gaussians-zstd", "gaussians-ply", *CODECS_OF_CODEBOOKS
-)
+    "gaussians-exact", "gaussians-quantized", "gaussians-tiles", "gaussians-zstd", "gaussians-ply",
+    *CODECS_OF_CODEBOOKS,
+)  # fmt: skip
 OF_ANCHORS = ("hac", "hac-plus", "cat-3dgs")
 """Methods whose files anchors.wasm knows, in mode `exact`."""
 WITH_TABLES = ("wisp", *OF_ANCHORS)
