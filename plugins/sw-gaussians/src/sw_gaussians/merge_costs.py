@@ -42,12 +42,16 @@ class Columns(NamedTuple):
         return Columns(*(values[..., start:end] for values in self))
 
 
-def columns_of(splats: Splats, unit: float) -> Columns:
-    """Columns of Gaussians [N]; `unit` is the scene's size, so that prices do not depend on what its lengths mean."""
+def columns_of(splats: Splats, unit: float, center: Tensor | None = None) -> Columns:
+    """Columns of Gaussians [N]; `unit` is the scene's size, so that prices do not depend on what its lengths mean.
+
+    center  [3] the origin of the places; None: their mean
+    """
+    center = splats.means.mean(dim=0) if center is None else center
     scales = splats.scales / unit
     full = covariances(scales, splats.quats)
     return Columns(
-        places=((splats.means - splats.means.mean(dim=0)) / unit).T.contiguous(),
+        places=((splats.means - center) / unit).T.contiguous(),
         six=torch.stack([full[:, i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))]),
         volumes=scales.prod(dim=1),
         masses=splats.opacities * surface(scales),

@@ -40,7 +40,8 @@ class Splats(NamedTuple):
 
     def rows(self, index: Tensor) -> Splats:
         """The Gaussians of an index over the first dimension; that of a matrix [G,M] gives groups."""
-        return Splats(*(values[index] for values in self))
+        flat = index.flatten()  # whole rows are copied faster than elements are picked
+        return Splats(*(each.index_select(0, flat).view(*index.shape, *each.shape[1:]) for each in self))
 
     def to(self, dtype: torch.dtype) -> Splats:
         """The same numbers in another precision."""
@@ -89,7 +90,7 @@ def covariances(scales: Tensor, quats: Tensor) -> Tensor:
 
 @torch.no_grad()
 def merge_groups(groups: Splats, *, rule: Rule = "ink", widen: bool = False) -> Splats:
-    """Return one Gaussian for each group, in float64; the order of the members does not matter.
+    """Return one Gaussian for each group, in float64, SH in their own; the order of the members does not matter.
 
     groups  Splats [G,M]: M members each; one of opacity 0 counts for nothing, unless all of the group are
     rule    of the opacity: see the module
@@ -99,7 +100,7 @@ def merge_groups(groups: Splats, *, rule: Rule = "ink", widen: bool = False) -> 
     The ink of more than two stops at pairs (inclusion and exclusion), and so is held to at least that of the member
     with most. Means, covariances and SH are the weighted moments, exact up to rounding.
     """
-    groups = groups.to(torch.float64)
+    groups = groups.to(torch.float64)._replace(sh=groups.sh)
     alphas = groups.opacities
     first = groups.means[:, :1]
     offsets = groups.means - first
@@ -131,7 +132,7 @@ def merge_groups(groups: Splats, *, rule: Rule = "ink", widen: bool = False) -> 
         scales=values.sqrt() * unit[:, None],
         quats=quaternions(axes),
         opacities=opacities.clamp(0, 1),
-        sh=(shares[..., None, None] * groups.sh).sum(dim=1),
+        sh=(shares.to(groups.sh)[..., None, None] * groups.sh).sum(dim=1),
     )
 
 

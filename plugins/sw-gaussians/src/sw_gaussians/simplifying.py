@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -15,7 +16,7 @@ from torch import Tensor
 from splatwizard_core.api import GaussianModel
 from sw_gaussians import face
 from sw_gaussians.made_up_cameras import extent_of
-from sw_gaussians.merge_costs import closeness, columns_of, prices
+from sw_gaussians.merge_costs import Columns, closeness, columns_of, prices
 from sw_gaussians.merging import Splats, merge_groups, model_of, splats_of
 from sw_gaussians.morton import interleave
 from sw_gaussians.native import GAUSSIANS
@@ -31,7 +32,9 @@ ENOUGH = 0.1
 CELLS = 20
 """Bits of a coordinate along the curve."""
 ROWS_AT_ONCE = {"cpu": 1 << 14, "cuda": 1 << 22}
-"""Pairs whose prices are found together: intermediate columns stay in the cache of a core."""
+"""Pairs whose prices are found, or that are merged, together: intermediate columns stay in the cache of a core."""
+MEASURED = 1 << 17
+"""Gaussians by which the size of a scene is told."""
 
 
 @torch.no_grad()
@@ -63,18 +66,81 @@ def _reduced(
 ) -> tuple[GaussianModel, Tensor | None]:
     splats = splats_of(model)
     weights = None if significance is None else (significance / significance.median().clamp_min(1e-30)).to(splats.means)
-    unit = _unit(splats)
+    pool = _Pool.of(splats, weights)
     near, wave = NEAR, 0
-    while (n := len(splats.means)) > max(count, 1):
-        order = _curve(splats.means, wave)
-        splats, weights = splats.rows(order), None if weights is None else weights[order]
-        pairs = _wave(splats, weights, unit, near, wave)
+    while (n := len(pool.order)) > max(count, 1):
+        pool.follow_curve(wave)
+        pairs = _wave(pool, near, wave)
         pairs = pairs[: min(n - count, math.ceil(TAKEN * len(pairs)))]
         if len(pairs) < min(ENOUGH * n, n - count):
             near *= 4
-        splats, weights = _merged(splats, weights, pairs, widen)
+        pool.merge(pairs, widen)
         wave += 1
-    return model_of(splats, model), weights
+    left = pool.order
+    return model_of(pool.splats.rows(left), model), None if pool.weights is None else pool.weights[left]
+
+
+@dataclass
+class _Pool:
+    """Gaussians that merge in place: neighbours in space stay neighbours in memory.
+
+    splats, weights     [N] of all rows; what was merged stands in the first row of its pair
+    table               [N,15] what prices look at but SH: place 3, covariance 6, volume, mass, opacity, colour 3
+    order               [n] rows that are left
+    unit, center        size and middle of the scene, world units
+    """
+
+    splats: Splats
+    weights: Tensor | None
+    table: Tensor
+    order: Tensor
+    unit: float
+    center: Tensor
+
+    @classmethod
+    def of(cls, splats: Splats, weights: Tensor | None) -> _Pool:
+        """Copies of Gaussians, along a curve."""
+        rows = _curve(splats.means, 0)
+        splats, weights = splats.rows(rows), None if weights is None else weights[rows]
+        unit, center = _unit(splats), splats.means.mean(dim=0)
+        parts = (Splats(*each) for each in zip(*map(_blocks, splats), strict=True))
+        table = torch.cat([_table(part, unit, center) for part in parts])
+        return cls(splats, weights, table, torch.arange(len(rows), device=rows.device), unit, center)
+
+    def follow_curve(self, wave: int) -> None:
+        """Bring what is left into the order of a wave's curve."""
+        self.order = self.order[_curve(self.splats.means[self.order], wave)]
+
+    def columns(self, rows: Tensor) -> Columns:
+        """What prices look at."""
+        found = self.table[rows].T.contiguous()
+        return Columns(found[:3], found[3:9], found[9], found[10], found[11], found[12:15],
+                       self.splats.sh[rows, 1:].flatten(1).T.contiguous())  # fmt: skip
+
+    def merge(self, pairs: Tensor, widen: bool) -> None:
+        """One Gaussian in place of each pair of rows [P,2]."""
+        for part in _blocks(pairs):
+            new = merge_groups(self.splats.rows(part), widen=widen).to(self.table.dtype)
+            for all_of, values in zip(self.splats, new, strict=True):
+                all_of[part[:, 0]] = values
+            self.table[part[:, 0]] = _table(new, self.unit, self.center)
+        if self.weights is not None:
+            self.weights[pairs[:, 0]] = self.weights[pairs].sum(dim=1)
+        gone = torch.zeros(len(self.table), dtype=torch.bool, device=pairs.device)
+        gone[pairs[:, 1]] = True
+        self.order = self.order[~gone[self.order]]
+
+
+def _blocks(values: Tensor) -> tuple[Tensor, ...]:
+    """Rows in blocks whose intermediate columns stay in the cache of a core."""
+    return values.split(ROWS_AT_ONCE["cpu" if values.device.type == "cpu" else "cuda"])
+
+
+def _table(splats: Splats, unit: float, center: Tensor) -> Tensor:
+    """Columns [N,15] of Gaussians, without their SH."""
+    found = columns_of(splats._replace(sh=splats.sh[:, :1]), unit, center)
+    single = (found.volumes[None], found.masses[None], found.opacities[None])
+    return torch.cat([found.places, found.six, *single, found.colors]).T
 
 
 def level_counts(count: int, levels: int | None = None, *, smallest: int = 20_000) -> list[int]:
@@ -100,10 +166,11 @@ def levels_of(model: GaussianModel, levels: int | None = None) -> Iterator[Gauss
 
 
 def _unit(splats: Splats) -> float:
-    """Size of the scene: the radius that holds half of what is visible."""
-    sizes = splats.scales.double().sort(dim=1, descending=True).values
-    areas = splats.opacities.double() * sizes[:, 0] * sizes[:, 1]
-    points, weights, widths = (values.cpu().numpy() for values in (splats.means.double(), areas, sizes[:, 0]))
+    """Size of the scene: the radius that holds half of what is visible, by Gaussians from everywhere in it."""
+    some = slice(None, None, max(len(splats.means) // MEASURED, 1))
+    sizes = splats.scales[some].double().sort(dim=1, descending=True).values
+    areas = splats.opacities[some].double() * sizes[:, 0] * sizes[:, 1]
+    points, weights, widths = (values.cpu().numpy() for values in (splats.means[some].double(), areas, sizes[:, 0]))
     return extent_of(points, weights, widths).r50
 
 
@@ -112,39 +179,36 @@ def _curve(points: Tensor, wave: int) -> Tensor:
     low = points.amin(dim=0).double()
     side = (points.amax(dim=0).double() - low).max().clamp_min(1e-30)
     shift = torch.tensor([(wave * step) % 1 for step in (0.618034, 0.754878, 0.569840)], device=points.device)
-    cells = (((points.double() - low) / side + shift) / 2 * (2**CELLS - 1)).long()
-    return torch.argsort(interleave(cells), stable=True)
+    step = (2**CELLS - 1) / 2
+    codes = [interleave(((part.double() - low) * (step / side) + step * shift).long()) for part in _blocks(points)]
+    return torch.argsort(torch.cat(codes), stable=True)
 
 
-def _wave(splats: Splats, weights: Tensor | None, unit: float, near: float, wave: int) -> Tensor:
-    """Pairs [P,2] of rows that are each other's cheapest neighbours, the cheapest first."""
-    native = splats.means.device.type == "cpu" and splats.means.dtype == torch.float32 and GAUSSIANS.try_load()
-    best, partner = (_native_partners if native else _partners)(splats, weights, unit, near, wave)
-    rows = torch.arange(len(best), device=best.device)
-    first = rows[(partner > rows) & (partner[partner] == rows)]
+def _wave(pool: _Pool, near: float, wave: int) -> Tensor:
+    """Pairs [P,2] of rows that are each other's cheapest neighbours along the curve, the cheapest first."""
+    native = pool.table.device.type == "cpu" and pool.table.dtype == torch.float32 and GAUSSIANS.try_load()
+    best, partner = (_native_partners if native else _partners)(pool, near, wave)
+    places = torch.arange(len(best), device=best.device)
+    first = places[(partner > places) & (partner[partner] == places)]
     first = first[torch.argsort(best[first], stable=True)]
-    return torch.stack([first, partner[first]], dim=1)
+    return pool.order[torch.stack([first, partner[first]], dim=1)]
 
 
-def _native_partners(
-    splats: Splats, weights: Tensor | None, unit: float, near: float, wave: int
-) -> tuple[Tensor, Tensor]:
+def _native_partners(pool: _Pool, near: float, wave: int) -> tuple[Tensor, Tensor]:
     """The same as `_partners`, of Gaussians in float32 on the CPU."""
-    columns = columns_of(splats._replace(sh=splats.sh[:, :1]), unit)
-    single = (columns.volumes[None], columns.masses[None], columns.opacities[None])
-    table = torch.cat([columns.places, columns.six, *single, columns.colors]).T.contiguous()
-    n, best = len(table), table.new_empty(len(table))
+    n, best = len(pool.order), pool.table.new_empty(len(pool.order))
     partner = torch.empty(n, dtype=torch.int64)
     face.merge_partners(
-        table=table, sh=splats.sh.flatten(1).contiguous(), weights=weights, window=WINDOW, wave=wave, near=near,
-        prices=table.new_empty(n, WINDOW), best=best, partner=partner,
+        table=pool.table, sh=pool.splats.sh.flatten(1), weights=pool.weights, order=pool.order, window=WINDOW,
+        wave=wave, near=near, prices=pool.table.new_empty(n, WINDOW), best=best, partner=partner,
     )  # fmt: skip
     return best, partner
 
 
-def _partners(splats: Splats, weights: Tensor | None, unit: float, near: float, wave: int) -> tuple[Tensor, Tensor]:
-    """The price [N] of the cheapest neighbour of each row, infinite if none is near, and its row [N], then its own."""
-    columns = columns_of(splats, unit)
+def _partners(pool: _Pool, near: float, wave: int) -> tuple[Tensor, Tensor]:
+    """The price [n] of the cheapest neighbour of each place of the curve, infinite if none is near, and its place [n],
+    then its own."""
+    columns, weights = pool.columns(pool.order), None if pool.weights is None else pool.weights[pool.order]
     n, device = len(columns.opacities), columns.places.device
     best = torch.full((n,), math.inf, dtype=columns.places.dtype, device=device)
     partner = torch.arange(n, device=device)
@@ -175,13 +239,3 @@ def _lot(rows: Tensor, offset: int, wave: int) -> Tensor:
     mixed = (rows * 2654435761 + offset * 40503 + wave * 97) & 0xFFFFFFFF
     mixed = ((mixed ^ (mixed >> 15)) * 2246822519) & 0xFFFFFFFF
     return ((mixed ^ (mixed >> 13)) & 0xFFFF).float() / 65535
-
-
-def _merged(splats: Splats, weights: Tensor | None, pairs: Tensor, widen: bool) -> tuple[Splats, Tensor | None]:
-    left = torch.ones(len(splats.means), dtype=torch.bool, device=pairs.device)
-    left[pairs.flatten()] = False
-    new = merge_groups(splats.rows(pairs), widen=widen).to(splats.means.dtype)
-    splats = Splats(*(torch.cat([old[left], more]) for old, more in zip(splats, new, strict=True)))
-    if weights is not None:
-        weights = torch.cat([weights[left], weights[pairs].sum(dim=1)])
-    return splats, weights

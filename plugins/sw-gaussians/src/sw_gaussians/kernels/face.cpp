@@ -21,11 +21,14 @@ SW_OPERATION(splatwizard_gaussians, sparse_adam) {
 
 SW_OPERATION(splatwizard_gaussians, merge_partners) {
   return splatwizard::guarded(call, [&](const splatwizard::Parallel& parallel) {
-    if (call->rows < 0 || call->rows > UINT32_MAX || call->width < 3 || call->window < 1 || call->window > 64)
+    if (call->rows < 0 || call->n < 0 || call->n > UINT32_MAX || call->width < 3 || call->window < 1 || call->window > 64)
       refuse("%lld rows of %lld coefficients, a window of %lld", (long long)call->rows, (long long)call->width,
              (long long)call->window);
+    for (int64_t i = 0; i < call->n; ++i)
+      if (call->order[i] < 0 || call->order[i] >= call->rows)
+        refuse("row %lld of %lld", (long long)call->order[i], (long long)call->rows);
     const splatwizard::MergePartnersArgs args{
-        call->table, call->sh, call->weights, call->rows, call->width, call->window,
+        call->table, call->sh, call->weights, call->order, call->n, call->width, call->window,
         uint32_t(call->wave), float(call->near), call->prices, call->best, call->partner};
     SW_SELECT(merge_partners)(args, parallel);
   });

@@ -22,18 +22,19 @@ typedef struct {
 } sparse_adam_call;
 SW_OPERATION(splatwizard_gaussians, sparse_adam);
 
-// The cheapest of the next and the last `window` rows for each row to merge with, by the price of merge_costs.py; itself
-// where none is near. A row of the table: place 3, covariance 6, volume, mass, opacity, colour 3.
+// The cheapest of the next and the last `window` rows of `order` for each of these to merge with, by the price of
+// merge_costs.py; itself where none is near. A row of the table: place 3, covariance 6, volume, mass, opacity, colour 3.
 typedef struct {
   sw_head head;
   const float* table;     // [rows, 15]
   const float* sh;        // [rows, width] coefficients, band 0 first
   const float* weights;   // [rows] or null
-  int64_t rows, width;
+  const int64_t* order;   // [n] rows that may merge, along a curve
+  int64_t rows, n, width;
   int64_t window, wave;
   double near;            // squared Mahalanobis distance
-  float* prices;          // [rows, window]
-  float* best;            // [rows]
-  int64_t* partner;       // [rows]
+  float* prices;          // [n, window]
+  float* best;            // [n]
+  int64_t* partner;       // [n] a place in the order
 } merge_partners_call;
 SW_OPERATION(splatwizard_gaussians, merge_partners);

@@ -22,17 +22,18 @@ struct SparseAdamArgs {
   float eps;
 };
 
-// The cheapest neighbour of each row of a [rows, 15] table along a curve.
+// The cheapest neighbour of each of n rows of a [rows, 15] table along a curve.
 struct MergePartnersArgs {
   const float* table;
   const float* sh;       // [rows, width], three of band 0 first
   const float* weights;  // [rows] or null
-  int64_t rows, width, window;
+  const int64_t* order;  // [n] rows of the table
+  int64_t n, width, window;
   uint32_t wave;
   float near;
-  float* prices;  // [rows, window] those of a row with the next ones
+  float* prices;  // [n, window] those of a place of the curve with the next ones
   float* best;
-  int64_t* partner;
+  int64_t* partner;  // its place
 };
 
 }  // namespace splatwizard

@@ -133,7 +133,7 @@ float squared_distance(const float* a, const float* b, int64_t n) {
 }  // namespace
 
 void merge_partners(const splatwizard::MergePartnersArgs& args, const splatwizard::Parallel& parallel) {
-  const int64_t n = args.rows, window = args.window, width = args.width;
+  const int64_t n = args.n, window = args.window, width = args.width;
   const Row* rows = reinterpret_cast<const Row*>(args.table);
   constexpr float none = std::numeric_limits<float>::infinity();
   parallel(n, 1024, [&](int64_t first, int64_t last) {
@@ -142,14 +142,15 @@ void merge_partners(const splatwizard::MergePartnersArgs& args, const splatwizar
         float& found = args.prices[i * window + k - 1];
         found = none;
         if (i + k >= n) continue;
-        const Row &a = rows[i], &b = rows[i + k];
+        const int64_t at = args.order[i], other = args.order[i + k];
+        const Row &a = rows[at], &b = rows[other];
         const Six both = sum(a.six, b.six);
         const Vec d{b.place.x - a.place.x, b.place.y - a.place.y, b.place.z - a.place.z};
         if (!(mahalanobis(both, d, determinant(both)) < args.near)) continue;
-        const float rest = squared_distance(args.sh + i * width + 3, args.sh + (i + k) * width + 3, width - 3);
+        const float rest = squared_distance(args.sh + at * width + 3, args.sh + other * width + 3, width - 3);
         float p = price(a, b, both, d, rest);
         if (!(p < 3e38f)) p = 3e38f;
-        if (args.weights != nullptr) p = p * (args.weights[i] + args.weights[i + k]) / 2;
+        if (args.weights != nullptr) p = p * (args.weights[at] + args.weights[other]) / 2;
         // Equal prices, as of copies, would have all point the same way.
         found = p * (1 + 1e-5f * lot(uint32_t(i), uint32_t(k), args.wave)) +
                 1e-30f * lot(uint32_t(i), uint32_t(k), args.wave + 1);
