@@ -261,9 +261,10 @@ def test_a_row_that_is_not_there_is_refused():
 
 def merge_partners(order: torch.Tensor, window: int) -> None:
     """Among two rows of zeros."""
-    face.merge_partners(table=torch.zeros(2, 15), sh=torch.zeros(2, 3), weights=None, order=order, window=window, wave=0,
-                        near=4.0, prices=torch.zeros(2, window), best=torch.zeros(2),
-                        partner=torch.zeros(2, dtype=torch.int64))  # fmt: skip
+    face.merge_partners(
+        table=torch.zeros(2, 15), sh=torch.zeros(2, 3), weights=None, order=order, window=window, wave=0, near=4.0,
+        prices=torch.zeros(2, window), best=torch.zeros(2), partner=torch.zeros(2, dtype=torch.int64),
+    )  # fmt: skip
 
 
 def test_merged_gaussians_may_grow_where_opacity_does_not_suffice():
