@@ -2,11 +2,12 @@
 
     python benchmarks/first_picture.py FILE.swz ... [--copies 8] [--prefixes 4] [--repeats 3] [--size 960x540]
 
-Counted from the navigation to the page: "first" is the first picture that is drawn, of the first cut in a file with
-cuts, "whole" the first one of all Gaussians. With `--copies` the Gaussians of each file stand side by side so often,
-with noise of a thousandth on every number, and are coded anew by `gaussians-quantized`, in so many packets
-(`--prefixes`). Chromium draws without a GPU here (SwiftShader), which is part of the seconds. Bars for 4 MB: first
-3 s on a desktop, 6 s on two shared cores; the whole of wisp 12 s.
+Counted from the navigation to the page until a pixel of the finished picture can be read and the browser begins its
+next frame: "first" is the first picture, of the first cut in a file with cuts, "whole" the first one of all Gaussians.
+With `--copies` the Gaussians of each file stand side by side so often, with noise of a thousandth on every number, and
+are coded anew by `gaussians-quantized`, in so many packets (`--prefixes`). Chromium draws without a GPU here
+(SwiftShader), which is part of the seconds. Bars for 4 MB: first 3 s on a desktop, 6 s on two shared cores; the whole
+of wisp 12 s.
 """
 
 from __future__ import annotations
@@ -33,6 +34,15 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from headless_chromium import WEBGL, Chromium, find_chromium
 
 TIMEOUT = 120.0
+SEEN = """new MutationObserver(changes => {
+  const gl = document.querySelector('canvas').getContext('webgl2'), { dataset } = document.documentElement;
+  gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));  // waits until all is drawn
+  for (const { attributeName } of changes) {
+    const name = attributeName === 'data-first-whole' ? 'seenWhole' : 'seenFirst';
+    requestAnimationFrame(() => { dataset[name] = performance.now().toFixed(1); });
+  }
+}).observe(document, { subtree: true, attributeFilter: ['data-first-frame', 'data-first-whole'] })"""
+"""The page says when it has given a picture to the renderer; this, in the page, when that one was there to be seen."""
 
 
 def enlarged(model: GaussianModel, copies: int) -> GaussianModel:
@@ -63,9 +73,10 @@ def opened(page: Path, size: tuple[int, int], folder: Path, timeout: float = TIM
     with tempfile.TemporaryDirectory(dir=folder) as profile:
         browser = Chromium(find_chromium() or "chromium", Path(profile), timeout=timeout, flags=WEBGL)
         try:
+            browser.send("Page.addScriptToEvaluateOnNewDocument", source=SEEN)
             browser.open(page, width=size[0], height=size[1])
             until = time.monotonic() + timeout
-            while browser.ask("document.documentElement.dataset.firstWhole") is None:
+            while browser.ask("document.documentElement.dataset.seenWhole") is None:
                 if time.monotonic() > until or browser.ask("document.documentElement.dataset.state") == "failed":
                     sys.exit(f"{page}: no picture: {browser.ask('document.getElementById(`told`).textContent')}")
                 time.sleep(0.1)
@@ -77,9 +88,7 @@ def opened(page: Path, size: tuple[int, int], folder: Path, timeout: float = TIM
 def seconds(page: Path, size: tuple[int, int], folder: Path) -> tuple[float, float]:
     """Return the seconds to the first picture and to the whole, in a browser of its own."""
     with opened(page, size, folder) as browser:
-        found = browser.ask(
-            "(({ firstFrame, firstWhole }) => [firstFrame, firstWhole])(document.documentElement.dataset)"
-        )
+        found = browser.ask("(({ seenFirst, seenWhole }) => [seenFirst, seenWhole])(document.documentElement.dataset)")
     return float(found[0]) / 1000, float(found[1]) / 1000
 
 

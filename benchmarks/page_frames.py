@@ -5,8 +5,9 @@
 The camera is turned by the pointer in every frame, so all of them are drawn; of frames that take over 50 ms the page
 draws fewer pixels while the camera moves, which is told as the share of the width. Gaussians are made up: a ball of
 them whose size falls with their number, as in trained scenes, SH degree 3. Chromium draws without a GPU here
-(SwiftShader, on all cores), which says how slow it is at worst. The first picture is counted when the page has given it
-to the renderer. Each figure has few frames where one takes seconds: take more `--seconds` then.
+(SwiftShader, on all cores), which says how slow it is at worst. A picture counts once a pixel of it can be read, and
+the time ends when that holds for the last one. Each figure has few frames where one takes seconds: take more
+`--seconds` then.
 """
 
 from __future__ import annotations
@@ -23,18 +24,22 @@ from view import made_up
 
 TIMEOUT = 240.0
 TURN = """new Promise(done => {
-  const canvas = document.querySelector('canvas'), data = document.documentElement.dataset;
+  const canvas = document.querySelector('canvas'), gl = canvas.getContext('webgl2');
+  const data = document.documentElement.dataset;
   const point = (kind, x) => canvas.dispatchEvent(new PointerEvent(kind, { bubbles: true, pointerId: 1,
     clientX: x, clientY: 200, buttons: 1, button: kind === 'pointermove' ? -1 : 0, isPrimary: true }));
   canvas.setPointerCapture = () => {};
   let x = 200, share = 0;
+  const finish = () => gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
   point('pointerdown', x);
+  finish();
   const start = performance.now(), before = Number(data.frames || 0);
   const step = now => {
     point('pointermove', x += 3);
     share = canvas.width / canvas.clientWidth;
     if (performance.now() - start < %d) return requestAnimationFrame(step);
     point('pointerup', x);
+    finish();
     done([Number(data.frames) - before, (performance.now() - start) / 1000, share]);
   };
   requestAnimationFrame(step);
@@ -44,7 +49,7 @@ TURN = """new Promise(done => {
 def figures(page: Path, size: tuple[int, int], seconds: float, folder: Path) -> tuple[float, float, float]:
     """Return seconds to the first whole picture, frames a second while turning, and the share of the width."""
     with opened(page, size, folder, TIMEOUT) as browser:
-        first = float(browser.ask("document.documentElement.dataset.firstWhole")) / 1000
+        first = float(browser.ask("document.documentElement.dataset.seenWhole")) / 1000
         drawn, took, share = browser.ask(TURN % (1000 * seconds))
     return first, drawn / took, share
 

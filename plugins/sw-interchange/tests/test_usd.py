@@ -189,7 +189,7 @@ def test_several_prims_make_one_scene_and_those_not_drawn_stay_out():
     more = SH.format(values=[(1, 1, 1)] * 2, d=0)
     found = decode(text(PRIM + PRIM.replace('"World"', '"Other"') + hidden, more=more))
     assert found.num_gaussians == 4
-    assert "/Hidden/S is not drawn" in found.report.warnings[0]
+    assert "/Hidden/S is invisible" in found.report.warnings[0]
 
 
 BROKEN = PRIM.replace("[(0.5, 1, 2), (0, 1, 1)]", "[(0.5, 1, 2)]")
@@ -216,6 +216,8 @@ BAD = {
     "a huge degree": (text(more=SH.format(values=[(1, 1, 1)], d=1 << 30)), "0 to 4"),
     "a negative degree": (text(more=SH.format(values=[(1, 1, 1)], d=-1)), "0 to 4"),
     "no splats": (b'#usda 1.0\ndef Mesh "M" {}', "no splats in it"),
+    "nothing drawn": (
+        text(PRIM.replace('"S" {{', '"S" {{ token visibility = "invisible"')), "none of its splats is drawn: /World/S"),
     "words": (b"#usda 1.0\nnonsense", "damaged"),
     "brackets": (b"#usda 1.0\n" + b'def Xform "A" {' * 200_000, "damaged|breaks off"),
     "a crate of zeros": (b"PXR-USDC" + bytes(4096), "damaged"),
@@ -229,6 +231,14 @@ def test_a_bad_file_is_refused(name):
     with pytest.raises(BitstreamError, match=reason) as caught:  # the reader's process has a limit of CPU time
         decode(data)
     assert len(str(caught.value)) < 400
+
+
+@with_usd_core
+@pytest.mark.parametrize("suffix", [".usda", ".usdc", ".usdz"])
+def test_what_has_only_the_suffix_is_called_damaged(suffix, tmp_path):
+    (tmp_path / f"x{suffix}").write_bytes(bytes(300))
+    with pytest.raises(BitstreamError, match="damaged, or no OpenUSD"):
+        read(tmp_path / f"x{suffix}")
 
 
 @with_usd_core

@@ -154,6 +154,36 @@ def test_the_command_counts_in_words_and_sw_info_reads_the_folder(written, tmp_p
     assert "1 level (1,200 Gaussians) in 1 piece, 1 unit of" in capsys.readouterr().out
     assert main(["info", str(folder), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["num_gaussians"] == 1200
+    assert main(["export", str(folder), str(tmp_path / "x.ply")]) == 2
+    assert f"the file in it is {folder / 'lod-meta.json'}" in capsys.readouterr().err
+    (folder / "lod-meta.json").write_text('{"version":1,')
+    assert main(["info", str(folder)]) != 0
+    assert "lod-meta.json: a damaged index" in capsys.readouterr().err
+
+
+def test_units_of_a_scene_that_was_there_before_go_and_nothing_else(model, tmp_path):
+    index, said = tmp_path / "lod-meta.json", []
+    write_lod(model, index, levels=3, chunk=400, device="cpu")
+    (tmp_path / "1_0" / "notes.txt").write_text("mine")
+    (tmp_path / "9_9").mkdir()
+    write_lod(model, index, device="cpu", say=said.append)
+    kept = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.glob("[1-9]_*/*"))
+    assert kept == ["1_0/notes.txt"]
+    assert (tmp_path / "9_9").is_dir()
+    assert not (tmp_path / "2_0").exists()
+    assert "2_0: of the scene that was here before, removed" in said
+    assert "1,200 Gaussians are few: there is one level; --levels makes more" in said
+
+
+@pytest.mark.parametrize(
+    "told", ['{"asset":{"generator":"other"},"filenames":["1_0/meta.json"]}', '{"asset":', "[]", '{"filenames":3}']
+)
+def test_what_an_index_of_others_names_stays(model, tmp_path, told):
+    (tmp_path / "1_0").mkdir()
+    (tmp_path / "1_0" / "meta.json").write_text("theirs")
+    (tmp_path / "lod-meta.json").write_text(told)
+    write_lod(model, tmp_path / "lod-meta.json", levels=1, device="cpu")
+    assert (tmp_path / "1_0" / "meta.json").read_text() == "theirs"
 
 
 def test_an_interrupt_leaves_no_folder(model, tmp_path):

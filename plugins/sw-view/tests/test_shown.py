@@ -96,6 +96,8 @@ def test_paths_offer_files_runs_and_folders_of_runs(tmp_path):
     assert alone.run is None
     with pytest.raises(UserInputError, match="holds no finished run"):
         find_entries(tmp_path / "b")
+    (tmp_path / "lod-meta.json").write_text("{}")
+    assert [entry.file for entry in find_entries(tmp_path)] == [tmp_path / "lod-meta.json"]
 
 
 def test_the_camera_of_a_browser_draws_like_one_of_the_scene(opened):

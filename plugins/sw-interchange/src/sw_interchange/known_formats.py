@@ -133,7 +133,8 @@ def detect(source: Source) -> Format:
         if name.endswith(INDEX) or b'"lodLevels"' in head or b'"filenames"' in head:
             return format_named("streamed-sog")
         return format_named("gltf" if b'"asset"' in head and b'"means"' not in head else "sog")
-    for suffix, found in ((".splat", "splat"), (".ksplat", "ksplat")):
+    for suffix, found in ((".splat", "splat"), (".ksplat", "ksplat"), (".usda", "usda"), (".usdc", "usdc"),
+                          (".usdz", "usdz")):  # fmt: skip
         if name.endswith(suffix):
             return format_named(found)
     raise BitstreamError(f"{source.name}: neither its first bytes nor its suffix is that of a format with Gaussians")

@@ -59,6 +59,12 @@ def read_usd(source: Source, limits: Limits, report: ReadReport) -> GaussianScen
         if not prim["has_sh"]:
             report.warnings.append(f"{prim['name']} has no colours, or too few for its degree: it is grey")
         parts.append(replace(part, antialiased=prim["antialiased"], kind="2dgs" if prim["surfels"] else "default"))
+    if not parts and told["notes"]:
+        first = told["notes"][0].partition(" ")[0]
+        raise BitstreamError(
+            f"{source.name}: none of its splats is drawn: {first} is invisible, or a guide or proxy: change its "
+            "visibility or purpose"
+        )
     if not parts:
         raise BitstreamError(f"{source.name}: there are no splats in it: no prim is a ParticleField3DGaussianSplat")
     if len({(each.antialiased, each.kind) for each in parts}) > 1:

@@ -73,7 +73,7 @@ def _splats(path: str) -> tuple[dict[str, Any], list[Any]]:
         if prim.GetTypeName() != TYPE:
             continue
         if not _is_drawn(prim):
-            notes.append(f"{prim.GetPath()} is not drawn, and is left out")
+            notes.append(f"{prim.GetPath()} is invisible, or a guide or proxy, and is left out")
             continue
         if len(prims) == MAX_PRIMS:
             raise RefusedError(f"more than {MAX_PRIMS:,} prims with splats")

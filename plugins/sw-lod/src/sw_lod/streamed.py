@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,9 @@ from sw_lod.tree import Node, Rows, build_tree, leaves_of
 Shares = NDArray[np.float64]
 UNSEEN = 1e-3
 """Of the mean squared picture of a leaf: added to that of each."""
+GENERATOR = "Splatwizard"
+UNIT = re.compile(rf"\d+_\d+/{re.escape(META)}")
+"""What the index calls a unit: level and number."""
 DIGITS = 7
 """Of numbers in the index; float32 has no more."""
 
@@ -45,6 +50,7 @@ def write_streamed(
     warnings: set[str] = set()
     total = 0
     # An index of an earlier scene would name units that are being replaced.
+    earlier = _units_of(index)
     index.unlink(missing_ok=True)
     for level, scene in enumerate(levels):
         for number, members in enumerate(_units(leaves, level, chunk)):
@@ -64,10 +70,33 @@ def write_streamed(
     errors = _errors(leaves, shares)
     text = json.dumps(_description(tree, levels, names, lods, errors), separators=(",", ":"), allow_nan=False)
     write_atomic(index, text.encode())
+    for unit in sorted(earlier - {name.partition("/")[0] for name in names}):
+        _remove_unit(index.parent / unit)
+        say(f"{unit}: of the scene that was here before, removed")
     return {
         "counts": [scene.num_gaussians for scene in levels], "units": len(names), "leaves": len(leaves),
         "bytes": total + len(text), "warnings": sorted(warnings),
     }  # fmt: skip
+
+
+def _units_of(index: Path) -> set[str]:
+    """Folders of the units that an index of ours names; none if there is no such index."""
+    try:
+        told = json.loads(index.read_bytes())
+        ours = told["asset"]["generator"] == GENERATOR
+        return {name.partition("/")[0] for name in told["filenames"] if ours and UNIT.fullmatch(name)}
+    except (OSError, ValueError, KeyError, TypeError):
+        return set()
+
+
+def _remove_unit(folder: Path) -> None:
+    """Remove the files of a unit, and its folder if nothing else is in it."""
+    if folder.is_symlink():
+        return
+    for file in (folder / META, *folder.glob("*.webp")):
+        file.unlink(missing_ok=True)
+    with suppress(OSError):
+        folder.rmdir()
 
 
 def _units(leaves: list[Node], level: int, chunk: int) -> Iterator[list[int]]:
@@ -123,7 +152,7 @@ def _description(
         return {"bound": bound, "children": [told(child) for child in node.children]}
 
     return {
-        "version": 1, "asset": {"generator": "Splatwizard"}, "count": sum(counts), "counts": counts,
+        "version": 1, "asset": {"generator": GENERATOR}, "count": sum(counts), "counts": counts,
         "lodLevels": len(levels), "lodErrors": bool(errors), "filenames": names, "tree": told(tree),
     }  # fmt: skip
 

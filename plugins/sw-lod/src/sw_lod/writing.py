@@ -88,6 +88,8 @@ def write_lod(
         if is_new:
             shutil.rmtree(target.parent, ignore_errors=True)
         raise
+    if levels is None and len(counts) == 1:
+        say(f"{counts[0]:,} Gaussians are few: there is one level; --levels makes more")
     ended = time.perf_counter()
     seconds = {"merge": round(merged - started, 3), "measure": round(measured - merged, 3),
                "write": round(ended - measured, 3)}  # fmt: skip

@@ -26,6 +26,9 @@ from splatwizard_core.tooling import (
     write_atomic,
 )
 
+INDEX = "lod-meta.json"
+"""Of a streamed SOG."""
+
 
 @click.command(short_help="what is in a file or scene")
 @click.argument("path", metavar="PATH", type=SCENE_OR_FILE)
@@ -42,11 +45,11 @@ def info(path: str, as_json: bool, chosen: Choices) -> None:
     where = existing(path) if Path(path).exists() else Path(path)
     if (where / "scene.swz").is_file() and (where / "config.toml").is_file():
         where = where / "scene.swz"
-    where = where / "lod-meta.json" if (where / "lod-meta.json").is_file() else where
+    where = where / INDEX if (where / INDEX).is_file() else where
     show: Callable[[dict[str, Any]], None] = _print_plain
     if where.suffix == ".swz" or (where.is_file() and _head(where, 4) == b"SPWZ"):
         kind, facts, show = "file", _file_facts(where), _print_file
-    elif where.suffix == ".json" and where.is_file() and not _holds_gaussians(_head(where)):
+    elif where.suffix == ".json" and where.is_file() and where.name != INDEX and not _holds_gaussians(_head(where)):
         kind, facts, show = "record", _record_facts(where), _print_record
     elif (importer := load_plugins().importers.of_suffix(where)) is not None:
         kind, facts = importer, _gaussian_facts(where)

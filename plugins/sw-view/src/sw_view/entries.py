@@ -26,7 +26,7 @@ from sw_view.packing import Packed, solid_means
 from sw_view.page_file import LIVE, MADE_UP, About
 from sw_view.shown_cameras import Surroundings, made_up_surroundings, surroundings_about, surroundings_of
 
-ENCODED, CONFIG = "scene.swz", "config.toml"
+ENCODED, CONFIG, INDEX = "scene.swz", "config.toml", "lod-meta.json"
 MOST = 200
 """Runs of one folder that are offered."""
 
@@ -66,6 +66,8 @@ def find_entries(path: Path) -> list[Entry]:
     if path.is_file():
         of_run = path.name == ENCODED and (path.parent / CONFIG).is_file()
         return [Entry(str(path), path, path.parent if of_run else None)]
+    if (path / INDEX).is_file():
+        return [Entry(str(path), path / INDEX, None)]
     found = [file for file in sorted(path.rglob(ENCODED)) if (file.parent / CONFIG).is_file()][:MOST]
     if not found:
         raise UserInputError(

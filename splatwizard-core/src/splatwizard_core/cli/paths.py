@@ -27,8 +27,8 @@ def existing_file(path: str | Path) -> Path:
     """A file that must be there; of a run directory the error names the file inside."""
     found = existing(path)
     if found.is_dir():
-        inside = found / "scene.swz"
-        hint = f"the file in it is {inside}" if inside.is_file() else "name the .swz or .ply in it"
+        inside = [found / name for name in ("scene.swz", "lod-meta.json") if (found / name).is_file()]
+        hint = f"the file in it is {inside[0]}" if inside else "name the .swz or .ply in it"
         raise UserInputError(f"{path} is a folder, and this command takes a file: {hint}")
     return found
 

@@ -170,7 +170,8 @@ def exporter_of(path: Path, plugins: PluginManager, name: str | None = None) -> 
     name = plugins.exporters.of_suffix(path) if name is None else plugins.exporters.entry(name).name
     if name is None:
         known = ", ".join(f"{s} ({e.name})" for e in plugins.exporters if (s := e.declared.get("suffix")))
-        raise UserInputError(f"no installed exporter writes '{path.suffix}' files ({path}); there are: {known}")
+        hint = "; `sw compress` writes .swz" if path.suffix == ".swz" else ""
+        raise UserInputError(f"no installed exporter writes '{path.suffix}' files ({path}); there are: {known}{hint}")
     return name
 
 
