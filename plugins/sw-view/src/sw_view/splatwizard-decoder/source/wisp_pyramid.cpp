@@ -12,6 +12,7 @@ namespace {
 constexpr int64_t DEEPEST = 15, FEATURES = 69, AT_ONCE = 1 << 14;
 constexpr int64_t BASE_WIDTH = 21, VIEW_WIDTH = 25, MEANS = 44;  // of sums with their count, and of means
 constexpr int64_t HIDDEN[4] = {32, 48, 32, 40}, STEPS[4] = {1, 2, 1, 1};
+constexpr int64_t ADAPTIVE = 1, SMALL = 2;  // flags of the file
 constexpr splatwizard::Parallel ALONE;
 
 int64_t outputs_of(int block) { return 2 * BLOCKS[block].width() + STEPS[block]; }
@@ -263,8 +264,8 @@ Context& read_pyramid(Bytes& from, const ExactTables& tables) {
   auto& found = *new Pyramid(tables);
   found.base_parts = 6, found.later_parts = 4;
   const auto flags = static_cast<int64_t>(from.integer(1));
-  if (flags > 1) refuse("the context has flags ", flags, ", which are not known");
-  found.adaptive = flags == 1;
+  if (flags > ADAPTIVE + SMALL) refuse("the context has flags ", flags, ", which are not known");
+  found.adaptive = flags & ADAPTIVE;
   for (int64_t i = 0; i < MEANS; ++i) found.priors[i] = UNIT / 16;
   for (int64_t i = 0; i < NUMBERS; ++i) {
     const int64_t at = i < BASE.end ? i : i + BASE.width();  // behind the activities of base
@@ -273,8 +274,9 @@ Context& read_pyramid(Bytes& from, const ExactTables& tables) {
   int lowest = HIGHEST_EXPONENT;
   for (int i = 0; i < 8; ++i) {
     const int block = i / 2;
-    const int64_t outputs = i % 2 ? outputs_of(block) : HIDDEN[block];
-    const int64_t inputs = i % 2 ? HIDDEN[block] : FEATURES + BLOCKS[block].first;
+    const int64_t hidden = HIDDEN[block] / (flags & SMALL ? 2 : 1);
+    const int64_t outputs = i % 2 ? outputs_of(block) : hidden;
+    const int64_t inputs = i % 2 ? hidden : FEATURES + BLOCKS[block].first;
     EightBitLayer layer;
     layer.read(from, outputs, inputs, true);
     lowest = layer.lowest() < lowest ? layer.lowest() : lowest;
