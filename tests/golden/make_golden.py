@@ -272,6 +272,7 @@ def settled(n: int, degree: int = 3, anchor: str = "center") -> GaussianModel:
 def splats(n: int, context: str, subsets: int = 1) -> SplatModel:
     """n splats of Wisp with scattered numbers that are fixed, in cells of levels 3 to 6, some of them shared.
 
+    context     "none", or "pyramid" with the large networks, or "small" with the small ones
     subsets     in so many of them, with one refinement, if there is more than one
     """
     from sw_wisp.appearance import AppearanceNetwork
@@ -283,7 +284,8 @@ def splats(n: int, context: str, subsets: int = 1) -> SplatModel:
     from sw_wisp.rounding import FINAL
 
     values, steps = Scattered(), torch.tensor(BASE_STEPS)
-    rate: Any = StaticRate(steps) if context == "none" else PyramidRate(steps, adaptive=True)
+    size = "small" if context == "small" else "large"
+    rate: Any = StaticRate(steps) if context == "none" else PyramidRate(steps, adaptive=True, size=size)
     network = AppearanceNetwork(hidden=3, degree=1)
     with torch.no_grad():
         for _, parameter in [*sorted(network.named_parameters()), *sorted(rate.named_parameters())]:

@@ -228,7 +228,8 @@ def rate_points() -> list[bytes]:
         for rate in plugins.methods.load(method).RATES:
             golden.CASES[name] = (method, rate, values, model)
             found.append(golden.encoded(name))
-    return found
+    golden.CASES["small"] = ("wisp", "r3", {}, lambda: golden.splats(20, "small"))
+    return [*found, golden.encoded("small")]
 
 
 @needs_wasmtime
