@@ -199,6 +199,16 @@ def test_a_page_of_anchors_holds_their_file_and_says_how_many(command, tmp_path)
     assert "<span>101 Gaussians</span><span>of 40 anchors</span>" in text
 
 
+def test_a_page_of_a_colour_field_holds_its_file(tmp_path):
+    file, page = GOLDEN / "compact3dgs_v1.swz", tmp_path / "x.html"
+    assert main(["export", str(file), str(page)]) == 0
+    text, facts = page.read_text("utf-8"), facts_of(page)
+    (module,) = re.findall(r'<script type="text/plain" id="wasm">(.*?)</script>', text)
+    assert zlib.decompress(base64.b64decode(module)) == (coded_file.FOLDER / "codebooks.wasm").read_bytes()
+    assert 'id="tables"' not in text
+    assert (facts["live"], facts["count"], "anchors" in facts) == (1, 24, False)
+
+
 def test_a_page_of_a_scene_holds_some_test_photographs(tmp_path):
     page, run = tmp_path / "x.html", [str(GOLDEN / "3dgs_one_v1.swz"), "--scene", "demo:tiny", "--html"]
     for given, most in (([], 4), (["--photos", "1"], 1), (["--photos", "0"], 0)):

@@ -182,8 +182,8 @@ def test_a_file_with_cuts_is_shown_coarse_first(browser, tmp_path, monkeypatch, 
     assert psnr(*(still(browser, page, 0, (160, 120)) for page in pages)) > 45
 
 
-@pytest.mark.parametrize("name", ["hac_half_v2", "hac_plus_v1", "cat_3dgs_refined_v2"])
-def test_anchors_are_evaluated_wherever_the_eye_comes_to_rest(browser, tmp_path, name):
+@pytest.mark.parametrize("name", ["hac_half_v2", "hac_plus_v1", "cat_3dgs_refined_v2", "compact3dgs_v1"])
+def test_what_depends_on_the_eye_is_evaluated_wherever_the_eye_comes_to_rest(browser, tmp_path, name):
     opened = open_entry(find_entries(GOLDEN / f"{name}.swz")[0], Choices(), load_plugins())
     page, (packed, note) = tmp_path / "anchors.html", for_page(opened)
     write_page(packed, page, about_page(opened), opened.around)

@@ -50,6 +50,8 @@ PARTS = {
 """Header value -> what it may name: a file may ask for parts of others, which the decoder lacks."""
 MOST_PLACES = 8
 """Cameras that the Gaussians of anchors are computed for while a page is written."""
+BRIGHTEST = 2.0
+"""Of the colours of a field, which end at no 1."""
 VECTORS = ("vq", "sh2/vq/header", "sh3/vq/header")
 """Sections whose first byte is 2 if their parts are those of others."""
 
@@ -109,6 +111,8 @@ def with_live(model: SplatModel, path: Path, cameras: Sequence[Camera]) -> Packe
     facts |= {"count": int(reader.static["num_gaussians"]), "live": 1, "reach": reach}
     if reader.method in OF_ANCHORS:
         facts["anchors"] = len(positions)
+    else:
+        facts["colors"] = [0.0, BRIGHTEST / 2047]
     text = base64.b64encode(path.read_bytes()).decode("ascii")
     return Packed(text, facts, positions.float().cpu().numpy(), reach, _decoder(reader))
 
