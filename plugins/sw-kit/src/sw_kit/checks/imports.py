@@ -7,6 +7,8 @@ import importlib.util
 from collections.abc import Iterator
 from pathlib import Path
 
+BLOCKS = (ast.stmt, ast.ExceptHandler, ast.match_case)
+
 
 def imports_of(package: str) -> dict[str, str]:
     """Return the dotted name of every module that a package or module imports when it runs -> the file that does."""
@@ -31,4 +33,5 @@ def _imported(node: ast.AST, package: str) -> Iterator[str]:
     typing_only = isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING")
     children = node.orelse if isinstance(node, ast.If) and typing_only else ast.iter_child_nodes(node)
     for child in children:
-        yield from _imported(child, package)
+        if isinstance(child, BLOCKS):  # no expression imports
+            yield from _imported(child, package)
