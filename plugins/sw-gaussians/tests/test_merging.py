@@ -9,6 +9,7 @@ from sw_gaussians import face, simplifying
 from sw_gaussians.merge_costs import closeness, columns_of, prices
 from sw_gaussians.merging import Splats, covariances, merge_groups, surface
 from sw_gaussians.native import GAUSSIANS
+from sw_gaussians.principal_axes import quaternions
 from sw_gaussians.simplifying import level_counts, merged_to
 
 from splatwizard_core.api import GaussianModel
@@ -109,8 +110,6 @@ def test_turning_and_scaling_commute_with_merging():
     groups = random_splats(20, 2)
     turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64))[0]
     turn = turn * torch.linalg.det(turn)
-    from sw_gaussians.merging import quaternions
-
     axes = torch.stack([torch.eye(3, dtype=torch.float64)] * 1) @ turn
     q = quaternions(axes)[0]
 

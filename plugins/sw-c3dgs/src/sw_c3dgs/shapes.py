@@ -7,6 +7,7 @@ Source: C3DGS (arXiv 2401.02436), section on sensitivity-aware vector clustering
 from __future__ import annotations
 
 import torch
+from sw_gaussians.principal_axes import principal_axes, quaternions
 from sw_reference.projection import covariances
 from torch import Tensor
 
@@ -54,27 +55,6 @@ def decomposed(found: Tensor) -> tuple[Tensor, Tensor]:
 
 def _decomposed(found: Tensor) -> tuple[Tensor, Tensor]:
     matrices = found[:, FULL].reshape(-1, 3, 3)
-    values, axes = torch.linalg.eigh(matrices + TINY * torch.eye(3, dtype=found.dtype, device=found.device))
-    axes = axes * torch.linalg.det(axes)[:, None, None]  # of three axes all signs may flip: then a rotation
+    values, axes = principal_axes(matrices + TINY * torch.eye(3, dtype=found.dtype, device=found.device))
     shapes = values.clamp_min(1e-12).sqrt()
-    return torch.nn.functional.normalize(shapes, dim=1), _quaternions(axes)
-
-
-def _quaternions(rotations: Tensor) -> Tensor:
-    """Unit quaternions [n,4], w >= 0, of rotation matrices [n,3,3]: by the largest of the four candidates."""
-    xx, yy, zz = rotations[:, 0, 0], rotations[:, 1, 1], rotations[:, 2, 2]
-    a, b, c = (rotations[:, i, j] - rotations[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0)))
-    d, e, f = (rotations[:, i, j] + rotations[:, j, i] for i, j in ((1, 0), (0, 2), (2, 1)))
-    candidates = torch.stack(  # row k is 4 q_k q
-        [
-            torch.stack([1 + xx + yy + zz, a, b, c], 1),
-            torch.stack([a, 1 + xx - yy - zz, d, e], 1),
-            torch.stack([b, d, 1 - xx + yy - zz, f], 1),
-            torch.stack([c, e, f, 1 - xx - yy + zz], 1),
-        ],
-        1,
-    )
-    largest = candidates.diagonal(dim1=1, dim2=2).argmax(1)
-    found = candidates[torch.arange(len(candidates), device=candidates.device), largest]
-    found = torch.nn.functional.normalize(found, dim=1)
-    return torch.where(found[:, :1] < 0, -found, found)
+    return torch.nn.functional.normalize(shapes, dim=1), quaternions(axes)

@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from splatwizard_core.api import GaussianModel, ShapeError
+from sw_gaussians.principal_axes import principal_axes, quaternions
 
 THOMSEN = 1.6075
 """Exponent of Thomsen's formula for the surface of an ellipsoid, at most 1.06 % off."""
@@ -115,8 +116,7 @@ def merge_groups(groups: Splats, *, rule: Rule = "ink", widen: bool = False) -> 
     members = covariances(scales, normalize(groups.quats, dim=-1))
     spread = offsets[..., :, None] * offsets[..., None, :]
     found = (shares[..., None, None] * (members + spread)).sum(dim=1)
-    # On the CPU: cusolver fails for some 100,000 matrices at once (CUSOLVER_STATUS_INTERNAL_ERROR, torch 2.11).
-    values, axes = (each.to(found.device) for each in torch.linalg.eigh(((found + found.mT) / 2).cpu()))
+    values, axes = principal_axes((found + found.mT) / 2)
     values = values.clamp_min(0)
     if rule == "ink":
         wanted, size = _ink(alphas, members, offsets, axes[..., 1:]), 2 * math.pi * (values[:, 1] * values[:, 2]).sqrt()
@@ -126,7 +126,6 @@ def merge_groups(groups: Splats, *, rule: Rule = "ink", widen: bool = False) -> 
     opacities = torch.where(size > 0, wanted / size.clamp_min(1e-300), most)
     if widen:
         values = values * opacities.clamp_min(1)[:, None]
-    axes = axes * torch.linalg.det(axes)[:, None, None]  # of three axes all signs may flip: then a rotation
     return Splats(
         means=(first + center * unit[:, None, None])[:, 0],
         scales=values.sqrt() * unit[:, None],
@@ -161,20 +160,3 @@ def _ink(alphas: Tensor, members: Tensor, offsets: Tensor, plane: Tensor) -> Ten
 def _det2(matrices: Tensor) -> Tensor:
     m = matrices
     return (m[..., 0, 0] * m[..., 1, 1] - m[..., 0, 1] * m[..., 1, 0]).clamp_min(0)
-
-
-def quaternions(rotations: Tensor) -> Tensor:
-    """Return unit quaternions [N,4] (w,x,y,z, w >= 0) of rotations [N,3,3], by the largest of four candidates."""
-    r = rotations
-    xx, yy, zz = r[:, 0, 0], r[:, 1, 1], r[:, 2, 2]
-    a, b, c = (r[:, i, j] - r[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0)))
-    d, e, f = (r[:, i, j] + r[:, j, i] for i, j in ((1, 0), (0, 2), (2, 1)))
-    candidates = torch.stack([
-        1 + xx + yy + zz, a, b, c,
-        a, 1 + xx - yy - zz, d, e,
-        b, d, 1 - xx + yy - zz, f,
-        c, e, f, 1 - xx - yy + zz,
-    ], dim=1).view(-1, 4, 4)  # row k is 4 q_k q  # fmt: skip
-    largest = candidates.diagonal(dim1=1, dim2=2).argmax(dim=1)
-    found = normalize(candidates.gather(1, largest[:, None, None].expand(-1, 1, 4))[:, 0], dim=1)
-    return torch.where(found[:, :1] < 0, -found, found)
