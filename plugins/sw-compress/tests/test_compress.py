@@ -11,8 +11,9 @@ from pathlib import Path
 import pytest
 import torch
 from click.testing import CliRunner
-from sw_compress import Compressed, compress
+from sw_compress import Compressed, compress, compressing
 from sw_compress.command import compress as command
+from sw_compress.command import default_output
 from sw_compress.stages import Stages
 
 from splatwizard_core.api import UserInputError
@@ -209,6 +210,8 @@ def test_a_source_is_never_replaced(small):
         ("ball.ply", ["--quality", "200dB"], "quality '200dB' must be a number in 15 .. 70"),
         ("ball.ply", ["--ratio", "0.5"], "ratio '0.5' must be a number in 1 .."),
         ("ball.ply", ["--size", "5kB", "--ratio", "2"], "give one of them"),
+        ("ball.ply", ["--size", "400"], "no file of 400 bytes was found: the smallest has about"),
+        ("ball.ply", ["b.ply", "--out", "one.swz"], "--out one.swz names one file, and there are 2 .*: name a folder"),
         ("ball.ply", ["--out", "no/such/a.swz"], "there is no folder no/such"),
         ("ball.ply", ["--out", "folder"], "folder is a folder: give the name of a file in it"),
         ("ball.ply", ["--out", "a.zip"], "a.zip: a file of this name would hold swz, .*: give --out FILE.swz"),
@@ -240,3 +243,15 @@ def test_the_name_of_the_result_chooses_the_format_and_an_older_file_is_replaced
     done = CliRunner().invoke(command, [str(source), *options])
     assert done.exit_code == 0, done.output
     assert read_gaussians(out, load_plugins()).num_rows > 100
+
+
+def test_a_size_out_of_reach_is_told_before_anything_is_drawn(source, monkeypatch):
+    monkeypatch.setattr(compressing, "made_up_views", lambda *_: pytest.fail("cameras were made up"))
+    with pytest.raises(UserInputError, match="smallest"):
+        compress(source, size=400, device="cpu")
+
+
+@pytest.mark.parametrize("name", ["lod-meta.json", "meta.json"])
+def test_what_comes_of_a_folder_with_an_index_lies_beside_it(tmp_path, name: str):
+    assert default_output(tmp_path / "garden" / name, ".swz") == (tmp_path / "garden.swz").resolve()
+    assert default_output(tmp_path / "other.json", ".swz") == tmp_path / "other.swz"

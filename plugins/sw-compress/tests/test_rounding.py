@@ -36,10 +36,13 @@ def test_one_attribute_changes_alone(ball):
     rounding = Rounding(ball(300), 0.4, True)
     whole = rounding.model_at(STEPS)
     finer = replace(STEPS, of={**STEPS.of, "rest": 0.001})
-    changed = rounding.changed(whole, "rest", finer)
+    changed = rounding.change(rounding.model_at(STEPS), "rest", finer)
     assert torch.equal(changed.sh_rest, rounding.model_at(finer).sh_rest)
     assert not torch.equal(changed.sh_rest, whole.sh_rest)
-    assert changed.quats.data_ptr() == whole.quats.data_ptr()
+    assert torch.equal(changed.quats, whole.quats)
+    for name in ("quat", "opacity", "dc", "scale", "positions"):  # and back again, in place
+        assert rounding.change(changed, name, STEPS) is changed
+    assert torch.equal(rounding.change(changed, "rest", STEPS).sh_rest, whole.sh_rest)
 
 
 @pytest.mark.parametrize("spread", [0, 3, 40_000])

@@ -220,7 +220,10 @@ def test_a_description_counts_with_the_files_that_it_names(tmp_path: Path):
     ]
     meta = tmp_path / "meta.json"
     meta.write_text(json.dumps({"means": {"files": names}}, ensure_ascii=False), "utf-8")
-    assert bytes_with_named(meta) == meta.stat().st_size + 120
+    assert bytes_with_named(meta) == meta.stat().st_size + 4120
+    (tmp_path / "lod-meta.json").write_text(json.dumps({"filenames": ["meta.json", "./a.webp"]}), "utf-8")
+    own = (tmp_path / "lod-meta.json").stat().st_size
+    assert bytes_with_named(tmp_path / "lod-meta.json") == own + meta.stat().st_size + 4120
     assert bytes_with_named(tmp_path / "a.webp") == 100
     plain = meta.rename(tmp_path / "meta.swz")
     assert bytes_with_named(plain) == plain.stat().st_size

@@ -14,7 +14,7 @@ from torch import Tensor
 UPPER = (0, 1, 2, 4, 5, 8)
 FULL = (0, 1, 2, 1, 3, 4, 2, 4, 5)
 DIAGONAL = (0, 3, 5)
-BLOCK = 1 << 16  # matrices that are decomposed at a time
+BLOCK = 1 << 16  # matrices whose shapes are found at a time
 TINY = 1e-8
 
 

@@ -5,9 +5,8 @@ A level is the step of an attribute in octaves of the step here; bits of the pos
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -69,6 +68,7 @@ class Quantized:
     method: str = "3dgs"
     origin: tuple[float, float, float] | None = None
     precise: bool = True
+    _last: list[tuple[GaussianModel, list[float], Rounding]] = field(default_factory=list, compare=False, repr=False)
 
     @property
     def power(self) -> float:
@@ -108,10 +108,14 @@ class Quantized:
     def rounding(self, model: GaussianModel) -> Rounding:
         """The rounding of a model; that of the last one is kept while it is as it was."""
         state = [self.power, *(getattr(model, name)._version for name in model.RAW)]
-        if not _last or _last[0][0]() is not model or _last[0][1] != state:
-            _last.clear()  # it holds a model, and so does the next
-            _last[:] = [(weakref.ref(model), state, Rounding(model, self.power, OWN_BASIS))]
-        return _last[0][2]
+        if not self._last or self._last[0][0] is not model or self._last[0][1] != state:
+            self.forget()  # it holds a model, and so does the next
+            self._last.append((model, state, Rounding(model, self.power, OWN_BASIS)))
+        return self._last[0][2]
+
+    def forget(self) -> None:
+        """Let the model go whose rounding is known."""
+        self._last.clear()
 
     def rounded(self, model: GaussianModel, levels: Levels) -> GaussianModel:
         """Return the Gaussians that a file of these levels decodes to, in the order of the model."""
@@ -160,9 +164,6 @@ class Quantized:
         settings = self.settings(levels).model_dump()
         numbers = {key: value for key, value in settings.items() if not isinstance(value, str)}
         return CodecChoice(name="gaussians-quantized", settings=numbers)
-
-
-_last: list[tuple[weakref.ref[GaussianModel], list[float], Rounding]] = []
 
 
 class _Sections:

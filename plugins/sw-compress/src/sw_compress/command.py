@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 FORMATS = ("swz", "sog", "spz")
 """Suffixes of what is written; the first is usual."""
+INDICES = ("lod-meta.json", "meta.json")
+"""Files that stand for the folder that they lie in."""
 
 
 @click.command(short_help="any splat file to a size, without photographs")
@@ -136,8 +138,10 @@ def _places(files: tuple[Path, ...], out: str | None, suffix: str) -> list[Path]
     elif out is None:
         places = [OUTPUT_FILE.check(default_output(file, suffix)) for file in files]
     else:
+        if Path(out).suffix.lower() in (f".{name}" for name in FORMATS) and not Path(out).is_dir():
+            raise UserInputError(f"--out {out} names one file, and there are {len(files)} to compress: name a folder")
         folder = OUTPUT_FOLDER.check(out)
-        places = [folder / f"{file.stem}{suffix}" for file in files]
+        places = [folder / default_output(file, suffix).name for file in files]
     sources = {file.resolve() for file in files}
     for place in places:
         if place.resolve() in sources:
@@ -152,7 +156,8 @@ def _places(files: tuple[Path, ...], out: str | None, suffix: str) -> list[Path]
 
 
 def default_output(path: Path, suffix: str) -> Path:
-    """Path beside the source with the suffix of the format."""
+    """Path beside the source with the suffix of the format; of a folder with its index, beside the folder."""
+    path = path.resolve().parent if path.name.lower() in INDICES else path
     found = path.with_suffix(suffix)
     return found if found != path else path.with_name(f"{path.stem}-small{suffix}")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import tempfile
 from collections.abc import Callable
@@ -22,11 +23,11 @@ from sw_compress.quality import PHOTOGRAPHS, Pictures, loss_against_photographs,
 from sw_compress.reducing import Reduction
 from sw_compress.refining import Refined, refine
 from sw_compress.rows import IMPORTANCE, with_degree
-from sw_compress.search import Choice, Search, for_quality, measured_again
+from sw_compress.search import Choice, Search, check_in_reach, for_quality, measured_again
 from sw_compress.source import Source, open_source
 from sw_compress.stages import Stages, peak_bytes
 from sw_compress.targets import Target
-from sw_compress.views import made_up_views, views_of_file
+from sw_compress.views import Views, made_up_views, views_of_file
 
 SWZ = "swz"
 LONGEST = 86_400
@@ -101,60 +102,119 @@ def compress(
         OUTPUT_FILE.check(os.fspath(out))
     given = None if cameras is None else views_of_file(Path(cameras))
     stages, plugins = Stages(), load_plugins() if plugins is None else plugins
-    chosen = choose_device(device, plugins)
-    with stages.timed("read"):
-        source = open_source(scene, plugins, chosen)
-    target = Target.of(size, quality, ratio, source.file_bytes)
-    model = source.model if sh_degree is None else with_degree(source.model, sh_degree)
-    rasterizer = NegotiatedRasterizer(plugins, device=chosen, options=source.raster)
-    with stages.timed("cameras"), torch.no_grad():
-        seen = made_up_views(source.model, rasterizer, views) if given is None else given
-        options = RasterOptions(alpha=True)
-        judge = Pictures(source.model, seen.judge, rasterizer, options)
-        held_out = Pictures(source.model, seen.held_out, rasterizer, options)
-    keeps_unseen = not drop_unseen and given is None and gaussians is None
-    pruning = Pruning(model, seen.fit, rasterizer, keeps_unseen=keeps_unseen)
-    reduction = Reduction(model, pruning, judge)
-    work = _Work(
-        source, model, judge, held_out, reduction, seen.fit, rasterizer, refine, target, gaussians, stages, plugins, say
-    )
-    make = _make_swz if format == SWZ else _make_other(format)
-    if out is not None:
-        with replacing(out) as temporary:
-            made, facts = make(work, temporary)
-        path, data = Path(out), None
-    else:
-        with tempfile.TemporaryDirectory(prefix="sw-compress-") as name:
-            folder = Path(name)
-            made, facts = make(work, folder / f"scene.{format}")
-            path, data = None, (folder / f"scene.{format}").read_bytes()
+    asked = _Asked(
+        size, quality, ratio, format, given, views, gaussians, sh_degree, drop_unseen, refine,
+        choose_device(device, plugins), plugins, stages, say,
+    )  # fmt: skip
+    with contextlib.ExitStack() as beside:
+        if out is not None:
+            place = Path(beside.enter_context(replacing(out)))
+        else:
+            place = Path(beside.enter_context(tempfile.TemporaryDirectory(prefix="sw-compress-"))) / f"scene.{format}"
+        written = _written(scene, asked, place)
+        # Only now, when neither source nor search are in memory.
+        made, facts = written.opened(place, asked)
+        data = place.read_bytes() if out is None else None
     with stages.timed("check"):
-        found = held_out.quality(made)
-    pruned = reduction.pruned(made.num_rows)
+        found = written.held_out.quality(made)
     record = {
-        "file": None if path is None else str(path),
+        "file": None if out is None else str(Path(out)),
         "format": format,
-        "source": {"file": source.name, "bytes": source.file_bytes, "gaussians": source.read},
-        "target": {"bytes": target.size, "psnr": target.quality},
+        **written.facts,
         **facts,
         "gaussians": made.num_rows,
-        "left_out": source.read - source.model.num_rows,
-        "pruned": pruned,
-        "merged": source.model.num_rows - made.num_rows - pruned,
-        "unseen": int(pruning.unseen.sum()),
         "sh_degree": made.active_sh_degree,
-        "antialiased": source.antialiased,
         "quality": found.as_dict(),
         "loss_of_photographs": {
             f"{each:g}": round(loss_against_photographs(found.psnr, each), 3) for each in PHOTOGRAPHS
         },
         "told": told_loss(found.psnr),
-        "cameras": seen.as_dict(),
+        "cameras": written.seen.as_dict(),
         "seconds": stages.rounded(),
-        "peak_bytes": peak_bytes(chosen),
-        "device": str(chosen),
+        "peak_bytes": peak_bytes(asked.device),
+        "device": str(asked.device),
     }
-    return Compressed(path, data, made, record)
+    return Compressed(None if out is None else Path(out), data, made, record)
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """Arguments of `compress`, checked."""
+
+    size: str | int | None
+    quality: str | float | None
+    ratio: str | float | None
+    format: str
+    given: Views | None
+    views: int | None
+    gaussians: int | None
+    sh_degree: int | None
+    drop_unseen: bool
+    refine: float
+    device: torch.device
+    plugins: PluginManager
+    stages: Stages
+    say: Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class _Written:
+    """A file that was written.
+
+    model       as it decodes, where that is known
+    facts       for the record
+    held_out    pictures of the source that only measure
+    """
+
+    model: GaussianModel | None
+    facts: dict[str, Any]
+    held_out: Pictures
+    seen: Views
+
+    def opened(self, path: Path, asked: _Asked) -> tuple[GaussianModel, dict[str, Any]]:
+        """The model of the file, and the bytes of its sections where they are not among the facts."""
+        if self.model is not None:
+            return self.model, {}
+        with asked.stages.timed("decode"):
+            model, reader = open_model(path, asked.plugins, asked.device)
+        assert isinstance(model, GaussianModel)  # of a method of explicit Gaussians
+        return model, {"sections": {"header": reader.header_bytes, **reader.sections}}
+
+
+def _written(scene: str | os.PathLike[str] | GaussianModel, asked: _Asked, path: Path) -> _Written:
+    """Write the file."""
+    stages = asked.stages
+    with stages.timed("read"):
+        source = open_source(scene, asked.plugins, asked.device)
+    target = Target.of(asked.size, asked.quality, asked.ratio, source.file_bytes)
+    model = source.model if asked.sh_degree is None else with_degree(source.model, asked.sh_degree)
+    coder = Quantized(asked.plugins, source.raster, precise=model.num_rows >= PRECISE_FROM)
+    if target.size is not None and asked.format == SWZ:
+        with stages.timed("read"):
+            check_in_reach(coder, model, asked.gaussians, target.size)
+    rasterizer = NegotiatedRasterizer(asked.plugins, device=asked.device, options=source.raster)
+    with stages.timed("cameras"), torch.no_grad():
+        seen = made_up_views(source.model, rasterizer, asked.views) if asked.given is None else asked.given
+        options = RasterOptions(alpha=True)
+        judge = Pictures(source.model, seen.judge, rasterizer, options)
+        held_out = Pictures(source.model, seen.held_out, rasterizer, options)
+    keeps_unseen = not asked.drop_unseen and asked.given is None and asked.gaussians is None
+    pruning = Pruning(model, seen.fit, rasterizer, keeps_unseen=keeps_unseen)
+    reduction = Reduction(model, pruning, judge)
+    work = _Work(source, model, coder, judge, held_out, reduction, seen.fit, rasterizer, target, asked)
+    made, count, facts = (_make_swz if asked.format == SWZ else _make_other)(work, path)
+    pruned = reduction.pruned(count)
+    facts = {
+        "source": {"file": source.name, "bytes": source.file_bytes, "gaussians": source.read},
+        "target": {"bytes": target.size, "psnr": target.quality},
+        **facts,
+        "left_out": source.read - source.model.num_rows,
+        "pruned": pruned,
+        "merged": source.model.num_rows - count - pruned,
+        "unseen": int(pruning.unseen.sum()),
+        "antialiased": source.antialiased,
+    }
+    return _Written(made, facts, held_out, seen)
 
 
 @dataclass
@@ -163,73 +223,66 @@ class _Work:
 
     source: Source
     model: GaussianModel
+    coder: Quantized
     judge: Pictures
     held_out: Pictures
     reduction: Reduction
     fit: list[Camera]
     rasterizer: NegotiatedRasterizer
-    refine: float
     target: Target
-    gaussians: int | None
-    stages: Stages
-    plugins: PluginManager
-    say: Callable[[str], None]
+    asked: _Asked
 
 
-def _make_swz(work: _Work, path: Path) -> tuple[GaussianModel, dict[str, Any]]:
-    coder = Quantized(work.plugins, work.source.raster, precise=work.model.num_rows >= PRECISE_FROM)
-    with work.stages.timed("score"):
+def _make_swz(work: _Work, path: Path) -> tuple[GaussianModel | None, int, dict[str, Any]]:
+    """Write the file; return None for its model, the number of its Gaussians, and facts."""
+    asked, stages, coder = work.asked, work.asked.stages, work.coder
+    with stages.timed("score"):
         setattr(work.model, IMPORTANCE, work.reduction.pruning.importance)
-    with work.stages.timed("sensitivities"):
+    with stages.timed("sensitivities"):
         errors = Errors(coder, work.model, work.judge)
-    search = Search(coder, work.model, work.reduction, work.judge, errors, work.gaussians)
+    search = Search(coder, work.model, work.reduction, work.judge, errors, asked.gaussians)
     refined: Refined | None = None
 
     def better(choice: Choice) -> Choice:
         nonlocal refined
         levels = choice.allocation.levels
-        with work.stages.timed("refine"):
-            refined = refine(choice.model, work.model, work.fit, work.rasterizer, coder, levels, seconds=work.refine)
+        with stages.timed("refine"):
+            refined = refine(choice.model, work.model, work.fit, work.rasterizer, coder, levels, seconds=asked.refine)
         return Choice(refined.model, errors.curves(coder, refined.model), choice.allocation)
 
     if work.target.size is not None:
-        filled = fill(search, work.target.size, path, work.stages, work.say)
-        if work.refine:
-            filled = fill(search, work.target.size, path, work.stages, work.say, better(filled.choice))
+        filled = fill(search, work.target.size, path, stages, asked.say)
+        if asked.refine:
+            filled = fill(search, work.target.size, path, stages, asked.say, better(filled.choice))
     else:
         assert work.target.quality is not None  # one of the two is given
-        with work.stages.timed("search"):
+        with stages.timed("search"):
             choice = for_quality(search, work.target.quality, work.held_out)
-        if work.refine:
+        if asked.refine:
             choice = measured_again(search, better(choice), work.target.quality, work.held_out)
-        with work.stages.timed("encode"):
+        with stages.timed("encode"):
             filled = Filled(choice, coder.encode(choice.model, choice.allocation.levels, path), 1)
-    with work.stages.timed("decode"):
-        model, reader = open_model(path, work.plugins, work.model.device)
-    assert isinstance(model, GaussianModel)  # of a method of explicit Gaussians
     facts = {
         "bytes": filled.bytes,
-        "sections": {"header": reader.header_bytes, **reader.sections},
         "precision": coder.settings(filled.choice.allocation.levels).model_dump(exclude={"positions", "entropy"}),
         "encodes": filled.encodes,
         "refined": None if refined is None else refined.as_dict(),
         "tried": [{"gaussians": n, "bytes": round(b), "psnr": round(q, 2)} for n, b, q in search.tried],
     }
-    return model, facts
+    return None, filled.choice.model.num_rows, facts
 
 
-def _make_other(name: str) -> Callable[[_Work, Path], tuple[GaussianModel, dict[str, Any]]]:
-    def make(work: _Work, path: Path) -> tuple[GaussianModel, dict[str, Any]]:
-        with work.stages.timed("search"):
-            found: FormatFile = format_file(
-                name, work.model, work.reduction, work.judge, work.held_out, work.target, work.gaussians, work.plugins,
-                antialiased=work.source.antialiased, say=work.say,
-            )  # fmt: skip
-        path.write_bytes(found.data)
-        facts = {
-            "bytes": len(found.data), "sections": found.sections, "precision": found.settings,
-            "encodes": found.encodes, "tried": found.tried,
-        }  # fmt: skip
-        return found.model, facts
-
-    return make
+def _make_other(work: _Work, path: Path) -> tuple[GaussianModel | None, int, dict[str, Any]]:
+    """Write a file of another program; return its model, the number of its Gaussians, and facts."""
+    asked = work.asked
+    with asked.stages.timed("search"):
+        found: FormatFile = format_file(
+            asked.format, work.model, work.reduction, work.judge, work.held_out, work.target, asked.gaussians,
+            asked.plugins, antialiased=work.source.antialiased, say=asked.say,
+        )  # fmt: skip
+    path.write_bytes(found.data)
+    facts = {
+        "bytes": len(found.data), "sections": found.sections, "precision": found.settings,
+        "encodes": found.encodes, "tried": found.tried,
+    }  # fmt: skip
+    return found.model, found.model.num_rows, facts

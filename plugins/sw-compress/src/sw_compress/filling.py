@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splatwizard_core.api import UserInputError
 from sw_compress.coders import POSITIONS
-from sw_compress.search import Choice, Search, for_size, least_bytes
+from sw_compress.search import Choice, Search, for_size, too_small
 from sw_compress.targets import LEAST_SHARE
 
 if TYPE_CHECKING:
@@ -77,9 +76,6 @@ def fill(
         with stages.timed("search"):
             return for_size(search, budget)
 
-    least = least_bytes(search)
-    if least > 2 * size:
-        raise _too_small(size, f"about {least:,.0f}")
     choice, best, most = chosen or choose(size), None, 0
     while choice is not None:
         written = file.write(choice.model, choice.allocation.levels)
@@ -94,7 +90,7 @@ def fill(
         best = coarsest
         most = file.write(best.model, best.allocation.levels)
         if most > size:
-            raise _too_small(size, f"{most:,}")
+            raise too_small(size, f"{most:,}")
     assert best is not None  # a search looks at one part at least
     if not _fills(most, size) and most < SMALL and not best.is_finest:
         best, most = _finer(file, best, most, size)
@@ -107,10 +103,6 @@ def fill(
 
 def _fills(written: int, size: int) -> bool:
     return LEAST_SHARE * size < written <= size
-
-
-def _too_small(size: int, smallest: str) -> UserInputError:
-    return UserInputError(f"no file of {size:,} bytes was found: the smallest has {smallest} bytes")
 
 
 def _finer(file: _File, choice: Choice, written: int, size: int) -> tuple[Choice, int]:

@@ -46,10 +46,11 @@ class Errors:
                     if level > coder.levels(name)[-1] or (level not in MEASURED and 2.0 ** logs[-1] > SMALL):
                         continue
                     steps = coder.whole_steps({**finest, name: level})
-                    error = pictures.error(rounding.changed(whole, name, steps)) - self.floor
+                    error = pictures.error(rounding.change(whole, name, steps)) - self.floor
                     levels, logs = [*levels, level], [*logs, float(np.log2(max(error, 1e-14)))]
                     bar.advance(level in MEASURED)
                 self._measured[name] = levels, logs
+                rounding.change(whole, name, coder.whole_steps(finest))
                 give_back()
 
     def at(self, name: str, levels: np.ndarray) -> np.ndarray:

@@ -97,7 +97,7 @@ class Pruning:
 
     def _score(self) -> None:
         """Judge what is left: infinite for what may not go, below zero for what is not seen and may."""
-        part = select(self._model, self._left)
+        part = self._model if not self._gone else select(self._model, self._left)
         with track(f"judge {len(self._left):,} Gaussians", total=len(self._cameras), unit="views") as bar:
             costs = removal_costs(
                 lambda camera: part.gaussians(camera.to(part.device), self._rasterizer),

@@ -14,6 +14,7 @@ import torch
 from sw_gaussians.simplifying import merged_by
 
 from splatwizard_core.api import GaussianModel
+from sw_codecs.models.quantized import FAINTEST
 from sw_compress.rows import IMPORTANCE, like, select
 
 if TYPE_CHECKING:
@@ -45,17 +46,20 @@ class Reduction:
         if count >= self.model.num_rows:
             return self.model
         place, known = self._place(count), count in self._chosen
-        best = self._by(count, POWERS[place])
+        found: GaussianModel | None = self._by(count, POWERS[place])
         if self.pictures is not None and not known:
-            error = self.pictures.error(best) if best.num_rows <= count else math.inf  # the others may not go
-            for power in POWERS[place + 1 :]:
-                found = self._by(count, power)
+            assert found is not None
+            error = self.pictures.error(found) if found.num_rows <= count else math.inf  # the others may not go
+            for trial in range(place + 1, len(POWERS)):
+                found = None  # one is in memory at a time: each is nearly as large as the model
+                found = self._by(count, POWERS[trial])
                 changed = self.pictures.error(found)
                 if changed >= error:
+                    found = None
                     break
-                best, error, place = found, changed, POWERS.index(power)
+                error, place = changed, trial
         self._chosen[count] = place
-        return best
+        return self._by(count, POWERS[place]) if found is None else found
 
     def pruned(self, count: int) -> int:
         """Count those removed to come to so many; the others that are gone have merged."""
@@ -73,10 +77,14 @@ class Reduction:
 
     def _by(self, count: int, power: float) -> GaussianModel:
         rows = self.pruning.rows(self._kept(count, power))
-        found, weights = select(self.model, rows), self.pruning.importance[rows]
         if len(rows) > count and power < 1:
-            merged, weights = merged_by(found, count, self._weights()[rows])
+            merged, weights = merged_by(self.model, rows, count, self._weights()[rows])
             found = like(self.model, merged)
+            drawn = found.opacity_logits >= FAINTEST  # of some that merged so little is left that nothing is drawn
+            if not bool(drawn.all()):
+                found, weights = select(found, drawn), weights[drawn]
+        else:
+            found, weights = select(self.model, rows), self.pruning.importance[rows]
         setattr(found, IMPORTANCE, weights)
         return found
 

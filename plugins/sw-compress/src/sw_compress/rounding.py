@@ -67,22 +67,28 @@ class Rounding:
         """The model as a file of these steps decodes to."""
         return self._of({parameter: self.parameter(name, steps) for parameter, name in NAMES.items()})
 
-    def changed(self, whole: GaussianModel, name: str, steps: Steps) -> GaussianModel:
-        """A model that was rounded, with one attribute at other steps."""
-        raw = {each: getattr(whole, each).detach() for each in whole.RAW}
-        raw |= {parameter: self.parameter(name, steps) for parameter, each in NAMES.items() if each == name}
-        return self._of(raw)
+    @torch.no_grad()
+    def change(self, whole: GaussianModel, name: str, steps: Steps) -> GaussianModel:
+        """Bring one attribute of a model that was rounded to other steps, in place."""
+        place: Tensor = next(getattr(whole, parameter) for parameter, each in NAMES.items() if each == name)
+        found = self.parameter(name, steps, place.detach())
+        if found.data_ptr() != place.data_ptr():
+            place.copy_(found)
+        return whole
 
     def _of(self, raw: dict[str, Tensor]) -> GaussianModel:
         return like(self.model, type(self.model)(**raw, active_sh_degree=self.model.active_sh_degree))
 
     @torch.no_grad()
-    def parameter(self, name: str, steps: Steps) -> Tensor:
-        """Values of an attribute, rounded, float32 in the shape of its parameter."""
+    def parameter(self, name: str, steps: Steps, out: Tensor | None = None) -> Tensor:
+        """Values of an attribute, rounded, float32 in the shape of its parameter.
+
+        out     where higher SH coefficients may go, by far the most
+        """
         if name == "positions":
             return on_grid(self.model.means.detach(), replace(self.grid, bits=steps.bits))
         if name == "rest":
-            found = torch.zeros_like(self.model.sh_rest)
+            found = torch.zeros_like(self.model.sh_rest) if out is None else out
             matrix = None if not self._has_basis(steps) else self._matrix()
             width = self.rest.shape[1]
             for start, symbols in self._rest_symbols(steps, matrix):

@@ -53,10 +53,7 @@ class Search:
 
     def parts(self) -> list[int]:
         """Numbers of Gaussians to try, falling."""
-        whole = self.model.num_rows
-        if self.count is not None:
-            return [min(self.count, whole)]
-        return sorted({max(1, round(share * whole)) for share in SHARES}, reverse=True)
+        return parts_of(self.model.num_rows, self.count)
 
     def part(self, count: int) -> tuple[GaussianModel, list[Curve]]:
         """The model with as many Gaussians as `count`, or as few as may stay, and its curves."""
@@ -67,6 +64,10 @@ class Search:
                 return found
             self._known[count] = found
         return self._known[count]
+
+    def gaussians(self, count: int) -> GaussianModel:
+        """The model of `part`."""
+        return self._known[count][0] if count in self._known else self.reduction.part(count)
 
     def note_coarsest(self, count: int, curves: list[Curve]) -> None:
         """Remember what `part` gave for `count` at its coarsest, if nothing smaller is known."""
@@ -80,7 +81,14 @@ class Search:
         if self._coarsest is None:
             return None
         _, count, curves = self._coarsest
-        return Choice(self.reduction.part(count), curves, at_price(curves, COARSEST_PRICE))
+        return Choice(self.gaussians(count), curves, at_price(curves, COARSEST_PRICE))
+
+
+def parts_of(whole: int, count: int | None) -> list[int]:
+    """Numbers of Gaussians to try, falling: `count` alone, or shares of the `whole`."""
+    if count is not None:
+        return [min(count, whole)]
+    return sorted({max(1, round(share * whole)) for share in SHARES}, reverse=True)
 
 
 @dataclass(frozen=True)
@@ -127,18 +135,22 @@ class Choice:
 
 def for_size(search: Search, budget: float) -> Choice | None:
     """The best picture in a file of an estimated `budget` bytes; None where nothing is so small."""
-    best, best_error, worse = None, math.inf, 0
+    best: tuple[int, list[Curve], Allocation] | None = None
+    best_error, worse, choice = math.inf, 0, None
     for count in search.parts():
+        choice = None  # its Gaussians go before the next ones are made
         choice, error, last = _looked_at(search, count, budget)
         if choice is not None:
             if error < best_error:
-                best, best_error, worse = choice, error, 0
+                best, best_error, worse = (count, choice.curves, choice.allocation), error, 0
             else:
-                worse += 1
-        choice = None  # its Gaussians go before the next ones are made
+                choice, worse = None, worse + 1
         if worse == PATIENCE or last:
             break
-    return best
+    if best is None or choice is not None:
+        return choice
+    count, curves, allocation = best
+    return Choice(search.gaussians(count), curves, allocation)
 
 
 def _looked_at(search: Search, count: int, budget: float) -> tuple[Choice | None, float, bool]:
@@ -156,14 +168,24 @@ def _looked_at(search: Search, count: int, budget: float) -> tuple[Choice | None
     return choice, error, last
 
 
-def least_bytes(search: Search) -> float:
-    """Bytes by the estimate of the fewest Gaussians as coarse as can be, evenly taken instead of the best.
+def check_in_reach(coder: Quantized, model: GaussianModel, count: int | None, size: int) -> None:
+    """Raise UserInputError for less than half of the estimate of the fewest Gaussians as coarse as can be.
 
-    No part that is worth more has half of them.
+    count   of Gaussians that stay; None: what is best
+
+    They are evenly taken instead of the best, and no part that is worth more has half of their bytes.
     """
-    few = torch.arange(0, search.model.num_rows, max(1, search.model.num_rows // search.parts()[-1]))
-    part = select(search.model, few.to(search.model.device)[: search.parts()[-1]])
-    return FIXED_BYTES + sum(float(size[-1]) for size in search.coder.sizes(part).values())
+    count = parts_of(model.num_rows, count)[-1]
+    few = torch.arange(0, model.num_rows, max(1, model.num_rows // count))
+    part = select(model, few.to(model.device)[:count])
+    least = FIXED_BYTES + sum(float(each[-1]) for each in coder.sizes(part).values())
+    if least > 2 * size:
+        raise too_small(size, f"about {least:,.0f}")
+
+
+def too_small(size: int, smallest: str) -> UserInputError:
+    """The error for a size out of reach."""
+    return UserInputError(f"no file of {size:,} bytes was found: the smallest has {smallest} bytes")
 
 
 def for_quality(search: Search, quality: float, held_out: Pictures) -> Choice:

@@ -23,7 +23,7 @@ from sw_compress.pruning import Pruning
 from sw_compress.quality import Pictures
 from sw_compress.reducing import Reduction
 from sw_compress.rows import IMPORTANCE
-from sw_compress.search import Search
+from sw_compress.search import Search, check_in_reach
 from sw_compress.stages import Stages
 from sw_compress.views import made_up_views, training_views
 
@@ -72,6 +72,7 @@ class Sized:
         part = GaussianModel(**{name: getattr(model, name).detach() for name in model.RAW},
                              active_sh_degree=model.active_sh_degree).eval()  # fmt: skip
         part.requires_grad_(False)
+        check_in_reach(coder, part, None, self._size)
         with torch.no_grad():
             seen = made_up_views(part, rasterizer, None) if scene is None else training_views(part, scene)
             judge = Pictures(part, seen.judge, rasterizer, RasterOptions(alpha=True))

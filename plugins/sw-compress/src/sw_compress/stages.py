@@ -12,6 +12,8 @@ from pathlib import Path
 import psutil
 import torch
 
+from sw_rasterizers import memory
+
 
 @dataclass
 class Stages:
@@ -36,7 +38,8 @@ class Stages:
 
 
 def give_back() -> None:
-    """Return free memory to the system, where the C library holds on to it: blocks of some MB leave as much behind."""
+    """Return free memory to the system, where the rasterizer or the C library hold on to it."""
+    memory.give_back()
     with contextlib.suppress(OSError, AttributeError, TypeError):  # glibc has it
         ctypes.CDLL(None).malloc_trim(0)
 

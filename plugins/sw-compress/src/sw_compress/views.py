@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 LEAST, MOST = {"cpu": 18, "cuda": 48}, {"cpu": 60, "cuda": 120}
 """Cameras in all that are made up, by kind of device: the fewer, the more Gaussians there are."""
-DRAWN = {"cpu": 4e6, "cuda": 4e8}
+DRAWN = {"cpu": 4e6, "cuda": 5e7}
 """Gaussians times cameras above which there are the fewest."""
 JUDGED, HELD_OUT = 1 / 6, 1 / 6
 """Share of the cameras that choose among what others have pruned, and of those that only measure."""

@@ -58,6 +58,8 @@ TRIES = 8
 MOST_JUDGED = 200_000
 """Gaussians, the largest and most opaque ones, that are drawn to judge a candidate."""
 JUDGED_WIDTH = 160
+FEW_VALUES, SAMPLE, AROUND = 4096, 1024, 64
+"""Values that are sorted for a quantile, and how many of more tell where it is, some places around."""
 FEWEST = 6
 """Plausible views below which the scene is taken to be as large as its dense half."""
 
@@ -157,11 +159,28 @@ def extent_of(points: Array, areas: Array, sizes: Array) -> Extent:
 
 def weighted_quantiles(values: Array, weights: Array, shares: tuple[float, ...]) -> Array:
     """Return the smallest values [len(shares)] below or at which so much of the weight lies."""
+    total = float(weights.sum())
+    return np.array([_weighted_quantile(values, weights, share * total) for share in shares])
+
+
+def _weighted_quantile(values: Array, weights: Array, wanted: float) -> float:
+    """The smallest value below or at which `wanted` of the weight lies.
+
+    Where there are many, a sample tells between which two it is: a tenth of the time of sorting all.
+    """
+    while len(values) > FEW_VALUES:
+        some = slice(None, None, len(values) // SAMPLE)
+        order = np.argsort(values[some], kind="stable")
+        sample, total = values[some][order], np.cumsum(weights[some][order])
+        place = int(np.searchsorted(total, wanted / max(float(weights.sum()), 1e-300) * total[-1]))
+        low, high = sample[max(place - AROUND, 0)], sample[min(place + AROUND, len(sample) - 1)]
+        below, here = float(weights[values < low].sum()), (values >= low) & (values <= high)
+        if here.all() or not below < wanted <= below + float(weights[here].sum()):
+            break
+        values, weights, wanted = values[here], weights[here], wanted - below
     order = np.argsort(values, kind="stable")
-    total = np.cumsum(weights[order])
-    places = np.searchsorted(total, np.asarray(shares) * total[-1])
-    found: Array = values[order][np.minimum(places, len(values) - 1)]
-    return found
+    place = int(np.searchsorted(np.cumsum(weights[order]), wanted))
+    return float(values[order][min(place, len(values) - 1)])
 
 
 def _judged(model: GaussianModel, rasterizer: Rasterizer) -> tuple[_Judged, Extent]:

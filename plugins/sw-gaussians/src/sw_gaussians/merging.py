@@ -20,6 +20,9 @@ from sw_gaussians.principal_axes import principal_axes, quaternions
 THOMSEN = 1.6075
 """Exponent of Thomsen's formula for the surface of an ellipsoid, at most 1.06 % off."""
 
+ROWS_AT_ONCE = 1 << 16
+"""Rows of spherical harmonics that are copied together."""
+
 Rule = Literal["ink", "mass"]
 
 
@@ -49,14 +52,21 @@ class Splats(NamedTuple):
         return Splats(*(values.to(dtype) for values in self))
 
 
-def splats_of(model: GaussianModel) -> Splats:
-    """The Gaussians of a model, its active SH bands. Raises ShapeError for surfels, which have two scales."""
+def splats_of(model: GaussianModel, rows: Tensor | None = None) -> Splats:
+    """The Gaussians of a model, or some rows [M], its active SH bands; a copy of these.
+
+    Raises ShapeError for surfels, which have two scales.
+    """
     if model.NUM_SCALES != GaussianModel.NUM_SCALES:
         raise ShapeError("surfels cannot be merged: an average of flat ones has a thickness")
+    rows = torch.arange(model.num_rows, device=model.device) if rows is None else rows
     bands = (model.active_sh_degree + 1) ** 2 - 1
-    sh = torch.cat([model.sh_dc, model.sh_rest[:, :bands]], dim=1).detach()
-    return Splats(model.means.detach(), model.scales.detach(), normalize(model.quats.detach(), dim=1),
-                  model.opacities.detach(), sh)  # fmt: skip
+    sh = model.sh_dc.new_empty(len(rows), 1 + bands, 3)
+    for place, some in zip(sh.split(ROWS_AT_ONCE), rows.split(ROWS_AT_ONCE), strict=True):
+        place[:, :1], place[:, 1:] = model.sh_dc.detach()[some], model.sh_rest.detach()[some, :bands]
+    return Splats(model.means.detach()[rows], model.log_scales.detach()[rows].exp(),
+                  normalize(model.quats.detach()[rows], dim=1), model.opacity_logits.detach()[rows].sigmoid(),
+                  sh)  # fmt: skip
 
 
 def model_of(splats: Splats, like: GaussianModel) -> GaussianModel:

@@ -6,15 +6,17 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+AT_ONCE = 1 << 15
+"""Matrices that a solver gets. That of the GPU fails for twice as many: CUSOLVER_STATUS_INTERNAL_ERROR, torch 2.11."""
+
 
 def principal_axes(matrices: Tensor) -> tuple[Tensor, Tensor]:
     """Return eigenvalues [N,3], ascending, and rotations [N,3,3] whose columns are the axes, on their device.
 
     matrices    [N,3,3] symmetric
-
-    Computed on the CPU: cusolver fails for some 100,000 matrices at once (CUSOLVER_STATUS_INTERNAL_ERROR, torch 2.11).
     """
-    values, axes = (each.to(matrices.device) for each in torch.linalg.eigh(matrices.cpu()))
+    parts = [torch.linalg.eigh(part) for part in torch.split(matrices, AT_ONCE)]
+    values, axes = (torch.cat(each) for each in zip(*parts, strict=True))
     return values, axes * torch.linalg.det(axes)[:, None, None]  # of three axes all signs may flip: then a rotation
 
 

@@ -31,8 +31,12 @@ ENOUGH = 0.1
 """A wave that merges a smaller share of all Gaussians than this is followed by one that looks further."""
 CELLS = 20
 """Bits of a coordinate along the curve."""
+PAIRS_AT_ONCE = 1 << 14
+"""Pairs that merge together: in float64 each takes some kB on the way, which stay in the cache of a core."""
+COEFFICIENTS_AT_ONCE = 4
+"""Spherical harmonics that are put into another order together: they are most of a Gaussian."""
 ROWS_AT_ONCE = {"cpu": 1 << 14, "cuda": 1 << 22}
-"""Pairs whose prices are found, or that are merged, together: intermediate columns stay in the cache of a core."""
+"""Pairs whose prices are found together: intermediate columns stay in the cache of a core."""
 MEASURED = 1 << 17
 """Gaussians by which the size of a scene is told."""
 
@@ -50,21 +54,25 @@ def merged_to(
     The result is a new model without the SH bands that were not active; one that is small enough already is copied.
     Raises ShapeError for surfels.
     """
-    return _reduced(model, count, significance, widen)[0]
+    splats, _ = _reduced(splats_of(model), count, significance, widen)
+    return model_of(splats, model)
 
 
 @torch.no_grad()
-def merged_by(model: GaussianModel, count: int, significance: Tensor) -> tuple[GaussianModel, Tensor]:
-    """As `merged_to`, with the significance of each Gaussian of the result: the sum over what it stands for."""
-    merged, weights = _reduced(model, count, significance, widen=False)
+def merged_by(
+    model: GaussianModel, rows: Tensor, count: int, significance: Tensor, *, widen: bool = False
+) -> tuple[GaussianModel, Tensor]:
+    """As `merged_to` of some rows [M], with the significance of each Gaussian of the result.
+
+    significance    [M] of these rows; of the result it is the sum over what it stands for
+    """
+    splats, weights = _reduced(splats_of(model, rows), count, significance, widen)
     assert weights is not None  # they were given
-    return merged, weights.to(significance) * significance.median().clamp_min(1e-30)
+    return model_of(splats, model), weights.to(significance) * significance.median().clamp_min(1e-30)
 
 
-def _reduced(
-    model: GaussianModel, count: int, significance: Tensor | None, widen: bool
-) -> tuple[GaussianModel, Tensor | None]:
-    splats = splats_of(model)
+def _reduced(splats: Splats, count: int, significance: Tensor | None, widen: bool) -> tuple[Splats, Tensor | None]:
+    """At most so many Gaussians, and what they weigh in medians; overwrites the SH of those given."""
     weights = None if significance is None else (significance / significance.median().clamp_min(1e-30)).to(splats.means)
     pool = _Pool.of(splats, weights)
     near, wave = NEAR, 0
@@ -77,7 +85,7 @@ def _reduced(
         pool.merge(pairs, widen)
         wave += 1
     left = pool.order
-    return model_of(pool.splats.rows(left), model), None if pool.weights is None else pool.weights[left]
+    return pool.splats.rows(left), None if pool.weights is None else pool.weights[left]
 
 
 @dataclass
@@ -99,9 +107,9 @@ class _Pool:
 
     @classmethod
     def of(cls, splats: Splats, weights: Tensor | None) -> _Pool:
-        """Copies of Gaussians, along a curve."""
+        """Gaussians along a curve: their SH change places, other values are copied."""
         rows = _curve(splats.means, 0)
-        splats, weights = splats.rows(rows), None if weights is None else weights[rows]
+        splats, weights = _ordered(splats, rows), None if weights is None else weights[rows]
         unit, center = _unit(splats), splats.means.mean(dim=0)
         parts = (Splats(*each) for each in zip(*map(_blocks, splats), strict=True))
         table = torch.cat([_table(part, unit, center) for part in parts])
@@ -119,7 +127,7 @@ class _Pool:
 
     def merge(self, pairs: Tensor, widen: bool) -> None:
         """One Gaussian in place of each pair of rows [P,2]."""
-        for part in _blocks(pairs):
+        for part in pairs.split(PAIRS_AT_ONCE):
             new = merge_groups(self.splats.rows(part), widen=widen).to(self.table.dtype)
             for all_of, values in zip(self.splats, new, strict=True):
                 all_of[part[:, 0]] = values
@@ -239,3 +247,10 @@ def _lot(rows: Tensor, offset: int, wave: int) -> Tensor:
     mixed = (rows * 2654435761 + offset * 40503 + wave * 97) & 0xFFFFFFFF
     mixed = ((mixed ^ (mixed >> 15)) * 2246822519) & 0xFFFFFFFF
     return ((mixed ^ (mixed >> 13)) & 0xFFFF).float() / 65535
+
+
+def _ordered(splats: Splats, order: Tensor) -> Splats:
+    """The Gaussians in another order; their SH in place."""
+    for some in splats.sh.split(COEFFICIENTS_AT_ONCE, dim=1):
+        some.copy_(some[order])
+    return Splats(*(values[order] for values in splats[:4]), splats.sh)

@@ -32,6 +32,11 @@ def empty(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
     return torch.frombuffer(_RECYCLER.take(count * dtype.itemsize), dtype=dtype, count=count).view(shape)
 
 
+def give_back() -> None:
+    """Return the blocks that nothing uses to the system: what comes next needs the memory for something else."""
+    _RECYCLER.give_back()
+
+
 class _Recycler:
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -39,6 +44,14 @@ class _Recycler:
         self._returned: deque[mmap.mmap] = deque()
         self._idle: list[mmap.mmap] = []  # longest unused first
         self._used_bytes = self._most_used = 0
+
+    def give_back(self) -> None:
+        """Forget the idle blocks, and how much was in use at once."""
+        with self._lock:
+            while self._returned:
+                self._used_bytes -= len(self._returned.popleft())
+            self._idle.clear()
+            self._most_used = self._used_bytes
 
     def take(self, count: int) -> memoryview:
         """Return a view of at least so many bytes, which become free with it."""

@@ -122,17 +122,21 @@ def file_sha256(path: Path) -> str:
 
 
 def bytes_with_named(path: Path) -> int:
-    """Bytes of a file; of a .json or .gltf, which may describe images or buffers beside it, those that it names too.
+    """Bytes of a file; of a .json or .gltf, which may describe images or buffers, those that it names too.
 
-    Only plain names of files in its own folder count, each once. Raises OSError.
+    Only files in its own folder or below count, each once, and what a .json among them names. Raises OSError.
     """
-    size: int = path.stat().st_size
-    if path.suffix.lower() not in (".json", ".gltf") or size > LARGEST_DESCRIPTION:
-        return size
-    names = set(re.findall(r'"([^"\\/]{1,128})"', path.read_text("utf-8", errors="replace"))) - {path.name, ".", ".."}
-    beside = [path.parent / name for name in names]
-    others: int = sum(file.stat().st_size for file in beside if os.path.isfile(file))  # no error for a name too long
-    return size + others
+    sizes, waiting = {path: path.stat().st_size}, [path]
+    while waiting:
+        file = waiting.pop()
+        if file.suffix.lower() not in (".json", ".gltf") or sizes[file] > LARGEST_DESCRIPTION:
+            continue
+        for name in re.findall(r'"([^"\\]{1,128})"', file.read_text("utf-8", errors="replace")):
+            named, inside = file.parent / name, not name.startswith("/") and ".." not in name.split("/")
+            if inside and named not in sizes and os.path.isfile(named):  # no error for a name too long
+                sizes[named] = named.stat().st_size
+                waiting.append(named)
+    return sum(sizes.values())
 
 
 @contextlib.contextmanager

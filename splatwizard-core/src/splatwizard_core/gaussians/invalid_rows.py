@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from splatwizard_core.errors import SplatwizardError
 from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.gaussians.splat_model import finite_rows
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +46,7 @@ def leave_out_senseless(model: GaussianModel, name: str, *, tell: bool = True) -
     """
     finite = torch.ones(model.num_rows, dtype=torch.bool, device=model.device)
     for values in (model.means, model.sh_dc, model.sh_rest, model.quats):
-        finite &= torch.isfinite(values.detach()).flatten(1).all(dim=1)
+        finite &= finite_rows(values)
     finite &= ~model.opacity_logits.detach().isnan()
     scales = model.log_scales.detach()
     finite &= ~(scales.isnan() | (scales == torch.inf)).any(dim=1)

@@ -18,6 +18,12 @@ if TYPE_CHECKING:
     from splatwizard_core.rendering.rasterizer import Rasterizer
 
 
+def finite_rows(values: Tensor) -> Tensor:
+    """Whether each row of [N,...] is finite; some at a time, since what is found on the way is larger than they are."""
+    rows = torch.split(values.detach().unsqueeze(-1).flatten(1), 1 << 16)
+    return torch.cat([part.isfinite().all(dim=1) for part in rows])
+
+
 class SplatModel(nn.Module):
     """Parameters and mathematics of a scene; knows nothing of optimizers, schedules or files.
 
@@ -85,7 +91,7 @@ class SplatModel(nn.Module):
         bad = torch.zeros(self.num_rows, dtype=torch.bool, device=self.device)
         for value in (getattr(self, name) for name in self.ROWS):
             if value.is_floating_point():
-                bad |= ~value.isfinite().flatten(1).all(dim=1) if value.ndim > 1 else ~value.isfinite()
+                bad |= ~finite_rows(value)
         return int(bad.sum())
 
     def check_finite(self) -> int:

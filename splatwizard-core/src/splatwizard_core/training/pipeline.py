@@ -211,7 +211,7 @@ class TrainingRun:
             more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
             raise CheckpointError(
                 f"{where} was made by another plan or configuration ({'; '.join(changed[:3])}{more}): "
-                "resume with --allow-changed-plan, or use --fresh"
+                "give another --out, use --fresh, or resume all the same with --allow-changed-plan"
             )
         for line in changed:
             log.warning("resuming with a changed plan or configuration: %s", line)

@@ -9,7 +9,6 @@ integer counts reach the coder. Layout (docs/bitstream.md has it byte by byte):
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -23,6 +22,7 @@ from sw_codecs.coders.count_tables import pack_tables, rounded_counts, unpack_ta
 from sw_codecs.coders.model_spec import Table
 from sw_codecs.coders.symbol_stream import SymbolReader, SymbolWriter
 from sw_codecs.entropy.column_plan import CONSTANT, MAGNITUDES, MAX_VALUE, ColumnPlan, choose_plan
+from sw_codecs.fast.threads import each_of
 
 VERSION = 1
 CHUNK = 1 << 20
@@ -43,36 +43,28 @@ class Columns:
         """
         matrix = as_matrix(symbols.detach().cpu().numpy())
         found = np.zeros(matrix.shape)
-        for c, column in enumerate(matrix.T):
-            plan = choose_plan(np.ascontiguousarray(column))
-            if plan.kind == CONSTANT:
-                continue
-            classes, _, extra = plan.split(plan.residuals(np.ascontiguousarray(column)))
-            counts = rounded_counts(np.bincount(classes))
-            found[:, c] = np.log2(counts.sum() / counts[classes]) + (plan.parameter if extra is None else extra)
+        for c, values in enumerate(matrix.T):
+            plan, classes, counts, _ = _planned(values)
+            if plan.kind != CONSTANT:
+                counts = rounded_counts(counts)
+                extra = class_bits(classes, plan.parameter) if plan.kind == MAGNITUDES else plan.parameter
+                found[:, c] = np.log2(counts.sum() / counts[classes]) + extra
         return torch.from_numpy(found.reshape(symbols.shape)).to(symbols.device)
 
     def encode(self, symbols: np.ndarray, context: Any = None) -> bytes:
         """Bytes of `symbols`. Raises ValueError for values beyond 2^60 or more than 2^30 elements."""
         matrix = as_matrix(symbols)
         rows, columns = matrix.shape
-        plans, tables, classes_of, raw, crc = [], [], [], [], 0
+        crc = 0
         for values in matrix.T:
-            column = np.ascontiguousarray(values)
-            crc = checksum.crc32(column.astype("<i8", copy=False), crc)
-            plan = choose_plan(column)
-            plans.append(plan)
-            if plan.kind == CONSTANT:
-                continue
-            classes, codes, extra = plan.split(plan.residuals(column))
-            tables.append(np.bincount(classes, minlength=plan.size))
-            classes_of.append(classes)
-            raw.append(_pack_raw(codes, extra, plan.parameter))
-        chunks = encode_classes(classes_of, [Table(rounded_counts(t)) for t in tables])
+            crc = checksum.crc32(np.ascontiguousarray(values, "<i8"), crc)
+        found = each_of(_planned, list(matrix.T), rows=rows)
+        coded = [each for each in found if each[0].kind != CONSTANT]
+        tables = [counts for _, _, counts, _ in coded]
+        chunks = encode_classes([each[1] for each in coded], [Table(rounded_counts(counts)) for counts in tables])
         head = bytes([VERSION]) + rows.to_bytes(4, "little") + columns.to_bytes(2, "little") + crc.to_bytes(4, "little")
-        return b"".join(
-            [head, *(p.pack() for p in plans), pack_tables(tables), write_varint(len(chunks)), chunks, *raw]
-        )
+        plans, raw = (plan.pack() for plan, *_ in found), (low for *_, low in found)
+        return b"".join([head, *plans, pack_tables(tables), write_varint(len(chunks)), chunks, *raw])
 
     def decode(self, data: bytes, context: tuple[int, ...]) -> np.ndarray:
         """int64 of the shape `context`: (N, C) or (N,). Raises BitstreamError for anything `encode` did not write."""
@@ -92,15 +84,16 @@ class Columns:
             tables.append(Table(counts))
         chunks = ByteReader(bytes(reader.take(reader.varint(reader.left))))
         matrix = np.empty((columns, rows), np.int64)
-        classes_of = decode_classes(chunks, rows, tables)
+        decode_classes(
+            chunks, [each for each, plan in zip(matrix, plans, strict=True) if plan.kind != CONSTANT], tables
+        )
         found_crc = 0
         for column, plan in zip(matrix, plans, strict=True):
             if plan.kind == CONSTANT:
                 column[:] = plan.offset
                 plan.values(column)
             else:
-                classes = next(classes_of)
-                column[:] = plan.values(plan.join(classes, _unpack_raw(reader, classes, plan)))
+                column[:] = plan.values(plan.join(column, _unpack_raw(reader, column, plan)))
             if rows and not -MAX_VALUE <= column.min() <= column.max() <= MAX_VALUE:
                 raise BitstreamError("a value is beyond 2^60")
             found_crc = checksum.crc32(column.astype("<i8", copy=False), found_crc)
@@ -112,7 +105,7 @@ class Columns:
 
 
 def as_matrix(symbols: np.ndarray) -> np.ndarray:
-    """`symbols` as int64 [N, C]. Raises ValueError for what `columns` does not take."""
+    """`symbols` as integers [N, C]. Raises ValueError for what `columns` does not take."""
     symbols = np.asarray(symbols)
     if symbols.ndim not in (1, 2) or not np.issubdtype(symbols.dtype, np.integer):
         raise ValueError(f"columns take integers [N, C] or [N], not {symbols.dtype} {list(symbols.shape)}")
@@ -121,47 +114,58 @@ def as_matrix(symbols: np.ndarray) -> np.ndarray:
         raise ValueError(f"a matrix of shape {list(matrix.shape)} is too large")
     if matrix.size and (matrix.min() < -MAX_VALUE or matrix.max() > MAX_VALUE):
         raise ValueError("a value is beyond 2^60")
-    return matrix.astype(np.int64, copy=False)
+    return matrix
+
+
+def _planned(values: np.ndarray) -> tuple[ColumnPlan, np.ndarray, np.ndarray, bytes]:
+    """The plan of a column, its classes int32 [N], how often each occurs, and raw low bits; a constant has none."""
+    column = np.ascontiguousarray(values, np.int64)
+    plan = choose_plan(column)
+    if plan.kind == CONSTANT:
+        return plan, column[:0], column[:0], b""
+    classes, codes, extra = plan.split(plan.residuals(column))
+    return plan, classes.astype(np.int32), np.bincount(classes), _pack_raw(codes, extra, plan.parameter)
 
 
 def encode_classes(classes_of: list[np.ndarray], tables: list[Table]) -> bytes:
     """Chunks of at most 2^20 symbols: u32 byte length, u32 CRC-32 of the classes, range-coded words."""
-    parts: list[bytes] = []
-    writer = SymbolWriter()
 
-    def close() -> None:
-        nonlocal writer
-        if writer.count:
-            words = writer.finish()
-            parts.extend([len(words).to_bytes(4, "little"), writer.crc.to_bytes(4, "little"), words])
-            writer = SymbolWriter()
+    def encoded(chunk: list[tuple[int, slice]]) -> bytes:
+        writer = SymbolWriter()
+        for number, rows in chunk:
+            writer.put(classes_of[number][rows], tables[number])
+        words = writer.finish()
+        return len(words).to_bytes(4, "little") + writer.crc.to_bytes(4, "little") + words
 
-    for classes, table in zip(classes_of, tables, strict=True):
-        for start in range(0, len(classes), CHUNK):
-            piece = classes[start : start + CHUNK]
-            if writer.count + len(piece) > CHUNK:
-                close()
-            writer.put(piece, table)
-    close()
-    return b"".join(parts)
+    chunks = _chunks([len(classes) for classes in classes_of])
+    return b"".join(each_of(encoded, chunks))
 
 
-def decode_classes(chunks: ByteReader, rows: int, tables: list[Table]) -> Iterator[np.ndarray]:
-    """The classes of each coded column, int64 [rows]; checks each chunk's CRC when it has been used up."""
-    reader, crc = None, 0
-    for number, table in enumerate(tables, 1):
-        classes = np.empty(rows, np.int64)
+def _chunks(counts: list[int]) -> list[list[tuple[int, slice]]]:
+    """Pieces of columns with so many rows (number, rows), by the chunk that holds them."""
+    found, held = list[list[tuple[int, slice]]](), CHUNK
+    for number, rows in enumerate(counts):
         for start in range(0, rows, CHUNK):
-            count = min(CHUNK, rows - start)
-            if reader is None or reader.count + count > CHUNK:
-                if reader is not None:
-                    reader.check(crc)
-                length, crc = chunks.integer(4), chunks.integer(4)
-                reader = SymbolReader(chunks.take(length))
-            classes[start : start + count] = reader.get(count, table)
-        if reader is not None and number == len(tables):
-            reader.check(crc)
-        yield classes
+            size = min(CHUNK, rows - start)
+            if held + size > CHUNK:
+                found, held = [*found, []], 0
+            found[-1].append((number, slice(start, start + size)))
+            held += size
+    return found
+
+
+def decode_classes(chunks: ByteReader, columns: list[np.ndarray], tables: list[Table]) -> None:
+    """Fill columns with the classes of their values. Raises BitstreamError for a chunk whose CRC differs."""
+
+    def decode(coded: tuple[list[tuple[int, slice]], int, int, memoryview]) -> None:
+        chunk, _, crc, words = coded
+        reader = SymbolReader(words)
+        for number, rows in chunk:
+            columns[number][rows] = reader.get(rows.stop - rows.start, tables[number])
+        reader.check(crc)
+
+    parts = _chunks([len(column) for column in columns])
+    each_of(decode, [(each, size := chunks.integer(4), chunks.integer(4), chunks.take(size)) for each in parts])
 
 
 def _pack_raw(codes: np.ndarray, extra: np.ndarray | None, width: int) -> bytes:

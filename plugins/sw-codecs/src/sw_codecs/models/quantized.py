@@ -12,7 +12,7 @@ import logging
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -135,7 +135,7 @@ class Lattice:
 
     layout: Layout
     cells: NDArray[np.int64]
-    symbols: NDArray[np.int32]
+    symbols: NDArray[Any]
     basis: NDArray[np.int8] | None = None
     classes: NDArray[np.int32] | None = None
 
@@ -154,7 +154,7 @@ def encode(model: GaussianModel, writer: ContainerWriter, settings: QuantizedSet
     positions = plugins.position_codecs.load(settings.positions)()
     found = lattice(model, settings, positions.sort)
     layout = found.layout
-    packets, swell = significant_first(found, settings.prefixes)
+    packets, swell = significant_first(found, settings.prefixes) if settings.prefixes else ([], [])
     if packets:
         told = list(zip(map(len, packets), swell, strict=True))
         classes = suitable_classes(layout.num_gaussians // len(packets))
@@ -230,7 +230,7 @@ def significant_first(found: Lattice, count: int) -> tuple[list[NDArray[np.int64
 
 def _coverage(found: Lattice) -> NDArray[np.float64]:
     """Area that each row covers: opacity times the product of its first two scales, relative to the largest product."""
-    layout, symbols = found.layout, found.symbols.astype(np.float64)
+    layout, symbols = found.layout, found.symbols[:, : SCALES_FROM + 2].astype(np.float64)
     factors = np.ones(len(symbols)) if found.classes is None else precision.factors(found.classes)
     opacity = 1 / (1 + np.exp(-layout.opacity_step * factors * symbols[:, 3]))
     log_area = layout.scale_step * factors * symbols[:, SCALES_FROM : SCALES_FROM + 2].sum(axis=1)
@@ -270,7 +270,7 @@ def decode(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
 def finite(model: GaussianModel, reader: ContainerReader) -> GaussianModel:
     """The model. Raises BitstreamError if a number of it is not finite."""
     for name, parameter in model.named_parameters():
-        if not bool(torch.isfinite(parameter).all()):
+        if not all(bool(torch.isfinite(part).all()) for part in parameter.detach().split(ROWS_AT_ONCE)):
             raise BitstreamError(f"{reader.name}: decoded '{name}' is not finite: the file is damaged or hostile")
     return model
 
