@@ -28,13 +28,7 @@ LARGEST_QUAT_STEP = 0.5
 
 ROWS_AT_ONCE = 1 << 13
 
-_PARAMETERS = {
-    "dc": "sh_dc",
-    "opacity": "opacity_logits",
-    "scale": "log_scales",
-    "quat": "quats",
-    "rest": "sh_rest",
-}
+_PARAMETERS = {"dc": "sh_dc", "opacity": "opacity_logits", "scale": "log_scales", "quat": "quats", "rest": "sh_rest"}
 """Parameter that a step belongs to."""
 
 
