@@ -77,11 +77,10 @@ class Columns:
             raise BitstreamError(f"a matrix of {rows:,} x {columns:,}, expected {expected[0]:,} x {expected[1]:,}")
         plans = [ColumnPlan.unpack(reader) for _ in range(columns)]
         coded = [plan for plan in plans if plan.kind != CONSTANT]
-        tables = []
-        for counts in unpack_tables(reader, [plan.size for plan in coded]):
-            if not counts.any():
-                raise BitstreamError("a count table is empty")
-            tables.append(Table(counts))
+        found = unpack_tables(reader, [plan.size for plan in coded])
+        if not all(counts.any() for counts in found):
+            raise BitstreamError("a count table is empty")
+        tables = [Table(counts) for counts in found]
         chunks = ByteReader(bytes(reader.take(reader.varint(reader.left))))
         matrix = np.empty((columns, rows), np.int64)
         decode_classes(
@@ -134,11 +133,9 @@ def encode_classes(classes_of: list[np.ndarray], tables: list[Table]) -> bytes:
         writer = SymbolWriter()
         for number, rows in chunk:
             writer.put(classes_of[number][rows], tables[number])
-        words = writer.finish()
-        return len(words).to_bytes(4, "little") + writer.crc.to_bytes(4, "little") + words
+        return len(words := writer.finish()).to_bytes(4, "little") + writer.crc.to_bytes(4, "little") + words
 
-    chunks = _chunks([len(classes) for classes in classes_of])
-    return b"".join(each_of(encoded, chunks))
+    return b"".join(each_of(encoded, _chunks([len(classes) for classes in classes_of])))
 
 
 def _chunks(counts: list[int]) -> list[list[tuple[int, slice]]]:
