@@ -229,7 +229,9 @@ def test_native_partners_are_those_of_the_plain_version(bands, weighted):
     if not GAUSSIANS.try_load():
         pytest.skip("no compiled kernels")
     splats = Splats(*(each[:, 0].float() for each in random_splats(3000, 1)))
-    splats = splats._replace(sh=splats.sh[:, :bands], opacities=splats.opacities * (torch.arange(3000) > 5))
+    splats = splats._replace(
+        sh=splats.sh[:, :bands].contiguous(), opacities=splats.opacities * (torch.arange(3000) > 5)
+    )
     weights = torch.rand(3000, generator=torch.Generator().manual_seed(1)) if weighted else None
     pool = simplifying._Pool.of(splats, weights)
     pool.order = pool.order[::2].contiguous()
