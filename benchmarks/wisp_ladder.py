@@ -9,7 +9,6 @@ are missing, unfinished or failed. Families, each at r1, r3, r5 and two points b
 
 wisp        as its preset has it
 half        --cap 1.6 times as many grown, 0.81 caps begin at factor 1: the worthier half
-drop        half, and a tenth of the splats left out at each step
 priced      half, and the price of a bit by the number of training views: --views of 100
 
 Rungs, at r3 and once: half with
@@ -70,7 +69,7 @@ RUNGS: Mapping[str, Sequence[str]] = {
 def families(cap: int, views: int) -> dict[str, list[str]]:
     """Family -> its values."""
     half = [f"{GROWN}.cap={round(1.6 * cap)}", f"budget.cap={round(0.54 * cap)}"]
-    return {"wisp": [], "half": half, "drop": [*half, "loss.drop=0.1"], "priced": [*half, f"views={views}"]}
+    return {"wisp": [], "half": half, "priced": [*half, f"views={views}"]}
 
 
 def points(family: str, scene: str, images: str, seed: int, sets: Sequence[str]) -> list[Cell]:

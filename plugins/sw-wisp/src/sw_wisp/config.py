@@ -127,7 +127,6 @@ class Loss(Params):
     lambda_dssim: float = Field(0.2, ge=0, le=1, description="weight of 1 - SSIM; the rest is the weight of L1")
     opacity: float = Field(0.002, ge=0, description="weight of the mean opacity")
     opacity_stop: int = Field(10_501, ge=0, description="step from which on that term is gone")
-    drop: float = Field(0.0, ge=0, lt=1, description="share of splats that a step leaves out, until integers are fixed")
 
 
 class LayersOfTheFile(Params):

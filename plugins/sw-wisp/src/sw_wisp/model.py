@@ -59,7 +59,6 @@ class WispModel(SplatModel):
     counted     share of all splats whose bits are counted at each step
     layers      packets of the file
     packets     how many of them are drawn in training; None: all
-    drop        share of the splats that a step of training leaves out, at random
     """
 
     ROWS = ("means", "opacity", "shape", "size", "colour", "latents", "levels", "subsets")
@@ -95,7 +94,7 @@ class WispModel(SplatModel):
         self.network, self.rate = network, rate
         self.cube = cube
         self.phase, self.sharpness, self.sharpest, self.jitters, self.adapts = FLOAT, 1.0, sharpest, False, False
-        self.split_seed, self.counted, self.drop = 0, 0.0, 0.0
+        self.split_seed, self.counted = 0, 0.0
         self.layers, self.packets = Layers(), None
 
     def log_edges(self, levels: Tensor) -> Tensor:
@@ -218,17 +217,7 @@ class WispModel(SplatModel):
     def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
         """All splats, whatever the camera; in training `extras["bits"]` are those of one, in the mean of a sample."""
         shown = replay.shown(self) if replay.fits(self) else None
-        shown = self.shown(self.draws()) if shown is None else shown
-        return self._inputs(self._thinned(shown) if self.training and self.drop else shown)
-
-    def _thinned(self, shown: Shown) -> Shown:
-        """Leave some splats out; the others take over, so that as little light comes through them in the mean.
-
-        Of an opacity o the light that is lost is -ln(1 - o), and sums over splats.
-        """
-        denser = 1 - (1 - shown.opacities).clamp_min(1e-6) ** (1 / (1 - self.drop))
-        there = torch.rand_like(denser) >= self.drop
-        return shown._replace(opacities=denser * there)
+        return self._inputs(self.shown(self.draws()) if shown is None else shown)
 
     def draws(self) -> Draws:
         """Draw what a step needs."""

@@ -190,9 +190,8 @@ class WispStage(Stage):
 
     def count_bits(self, model: WispModel, step: int) -> None:
         """Let the bits of some splats be counted at a step where they have a price."""
-        learns = step < self.step_of(self.config.phases.freeze)
-        model.counted = self.config.rate_term.sample if learns and self.price(step) > 0 else 0.0
-        model.drop = self.config.loss.drop if learns else 0.0
+        priced = self.price(step) > 0 and step < self.step_of(self.config.phases.freeze)
+        model.counted = self.config.rate_term.sample if priced else 0.0
         model.packets = None
 
     def draw_prefix(self, model: WispModel) -> None:

@@ -227,18 +227,3 @@ def test_a_replayed_step_does_not_wait_for_the_device():
     finally:
         torch.cuda.set_sync_debug_mode("default")
     assert fixed.captures == 1
-
-
-def test_for_splats_that_a_step_leaves_out_the_others_stand_in():
-    model = made()
-    fixed = replayed(model)
-    whole = step(model, phase=FLOAT)[0][1]
-    model.drop = 0.25
-    draws = torch.stack([model.gaussians(None, None).opacities.detach() for _ in range(400)])
-    assert (draws == 0).float().mean() == pytest.approx(0.25, abs=0.01)
-    light = -torch.log1p(-draws.double()).mean(0)  # that they keep back
-    assert torch.allclose(light, -torch.log1p(-whole.double()), rtol=0.2)
-    assert fixed.captures == 1
-    model.gaussians(None, None).opacities.sum().backward()
-    assert model.opacity.grad.isfinite().all()
-    assert torch.allclose(model.eval().gaussians(None, None).opacities, whole)

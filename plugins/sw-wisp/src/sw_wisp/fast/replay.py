@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 Model = Any
 """A `WispModel`, which imports this."""
 
-READ_ANEW = ("sharpness", "split_seed", "counted", "packets", "drop")
+READ_ANEW = ("sharpness", "split_seed", "counted", "packets")
 """Numbers of the model that change no operator of a step, or decide which of its graphs is replayed."""
 
 
