@@ -4,6 +4,7 @@
 # make test-ray  the tests that need Ray (and submitit, for Slurm), which it installs
 # make test-wheels  that our wheels bring their kernels: built, installed and run where no compiler is; a quarter of an hour
 # make test-wasm  the decoder of .swz in WebAssembly: built again, and run in wasmtime, Node and Chromium
+# make decoder-hashes  SHA-256 of what it decodes, method by method, in Python, wasmtime, Node and Chromium; some ten minutes
 # make docs-site  the pages under docs/ as a site, by mkdocs-material, which it installs
 # make lint   ruff and mypy
 # make bench  speed and memory, as ratios measured in one run
@@ -22,7 +23,7 @@ TEST_JOBS ?= 2
 # Whole files, so that fixtures are made once, in the order of conftest.py: the long ones first.
 TEST_DIST := --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test test-wheels test-geometry test-ray test-browser test-interchange test-wasm docs-site coverage lint format bench kernels docs clean
+.PHONY: demo test test-wheels test-geometry test-ray test-browser test-interchange test-wasm decoder-hashes docs-site coverage lint format bench kernels docs clean
 
 demo: $(VENV)/.ready
 	@tools/check-system compiler
@@ -75,6 +76,10 @@ test-wasm: $(VENV)/.ready-dev
 	$(PIP) install -q ziglang==0.17.1 wasmtime==50.0.1
 	npm install --silent --prefix build/three three@0.180.0 || true
 	$(BIN)/python -m pytest -m slow plugins/sw-view/tests/test_decoder.py $(PYTEST_ARGS)
+
+decoder-hashes: $(VENV)/.ready-dev
+	$(PIP) install -q wasmtime==50.0.1
+	$(BIN)/python benchmarks/decoder_hashes.py
 
 docs-site: $(VENV)/.ready-dev
 	$(PIP) install -q -c constraints.txt mkdocs-material
