@@ -50,7 +50,7 @@ def train_and_encode(method: str, steps: int, out: Path) -> None:
 
 
 def told(paths: list[Path]) -> list[list[Told]]:
-    """What each engine says of each file."""
+    """Hashes or reasons of each engine, file by file."""
     contents, wasmtime = [path.read_bytes() for path in paths], Wasmtime()
     with tempfile.TemporaryDirectory() as folder:
         return [

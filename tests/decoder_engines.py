@@ -33,7 +33,7 @@ Told = tuple[str | None, str | None]
 
 
 def in_python(data: bytes, name: str = "file") -> Told:
-    """What the Python decoder says."""
+    """Hash or reason of the Python decoder."""
     try:
         return decode_model(ContainerReader(data, name), load_plugins()).parameter_hash(), None
     except BitstreamError as error:
@@ -80,7 +80,7 @@ class Wasmtime:
 
 
 def in_node(paths: Sequence[Path], into: Path | None = None) -> list[Told]:
-    """What Node says; the Gaussians of each file go to the folder `into`."""
+    """Hashes or reasons of Node; the Gaussians of each file go to the folder `into`."""
     options = ["--into", into] if into else []
     done = subprocess.run(["node", SCRIPT, *options, *paths], capture_output=True, text=True, check=True)
     return [tuple(json.loads(line)[:2]) for line in done.stdout.splitlines()]
@@ -115,7 +115,7 @@ def opened(address: str, profile: Path) -> Iterator[Chromium]:
 
 
 def in_chromium(paths: Sequence[Path], folder: Path) -> list[Told]:
-    """What Chromium says: in a worker, from the package as it is published. `folder` is empty."""
+    """Hashes or reasons of Chromium: in a worker, from the package as it is published. `folder` is empty."""
     (folder / "files").mkdir()
     names = []
     for number, path in enumerate(paths):

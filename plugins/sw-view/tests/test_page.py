@@ -147,7 +147,8 @@ def test_an_eye_goes_where_another_one_is():
     assert changes == 2  # its own first place, and this one
 
 
-def test_what_cannot_be_a_page_is_refused_and_nothing_is_left(tmp_path, capsys):
+def test_what_cannot_be_a_page_is_refused_and_nothing_is_left(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(coded_file, "covers", lambda _: False)  # as a file that only its own package decodes
     assert main(["export", str(GOLDEN / "compact3dgs_v1.swz"), str(tmp_path / "new.html")]) == 2
     assert "depend on the camera" in capsys.readouterr().err
     (tmp_path / "runs").mkdir()
@@ -179,10 +180,10 @@ def of_file(name: str) -> GaussianModel:
 def test_a_page_holds_the_file_where_that_is_smaller(monkeypatch, name):
     model, data = of_file(name), (GOLDEN / f"{name}.swz").read_bytes()
     packed = replace(pack(model), text="a" * 20_000)  # as if its Gaussians were no small family
-    monkeypatch.setattr(coded_file, "_decoder", lambda **_: "<script></script>")
+    monkeypatch.setattr(coded_file, "_decoder", lambda _: "<script></script>")
     assert base64.b64decode(with_file(model, packed).text) == data
     assert with_file(model, packed).facts == {**packed.facts, "reach": packed.reach}
-    monkeypatch.setattr(coded_file, "_decoder", lambda **_: " " * 20_000)
+    monkeypatch.setattr(coded_file, "_decoder", lambda _: " " * 20_000)
     assert with_file(model, packed) is packed
 
 
@@ -228,7 +229,7 @@ def test_a_model_that_is_not_that_of_its_file_is_packed(monkeypatch, change):
     model = of_file("3dgs_classes_v1")
     model.origin = {**model.origin, **change}
     packed = replace(pack(model), text="a" * 20_000)
-    monkeypatch.setattr(coded_file, "_decoder", lambda **_: "")
+    monkeypatch.setattr(coded_file, "_decoder", lambda _: "")
     assert with_file(model, packed) is packed
 
 
@@ -246,12 +247,11 @@ def test_the_policy_of_a_page_allows_its_own_script_and_style_alone(tmp_path):
 
 
 def test_the_decoder_in_the_page_is_the_module_that_is_shipped():
-    text = coded_file._decoder()
+    text = coded_file._elements("decoder.wasm", has_tables=False)
     (module,) = re.findall(r'<script type="text/plain" id="wasm">(.*?)</script>', text)
     assert zlib.decompress(base64.b64decode(module)) == (coded_file.FOLDER / "decoder.wasm").read_bytes()
     assert text.count("</script>") == 2
-    (tables,) = re.findall(
-        r'<script type="text/plain" id="tables">(.*?)</script>', coded_file._decoder(has_tables=True)
-    )
+    other = coded_file._elements("anchors.wasm", has_tables=True)
+    (tables,) = re.findall(r'<script type="text/plain" id="tables">(.*?)</script>', other)
     assert zlib.crc32(zlib.decompress(base64.b64decode(tables))[:-4]) == exact_tables().crc
     assert "export " not in text

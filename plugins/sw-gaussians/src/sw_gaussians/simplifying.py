@@ -120,7 +120,7 @@ class _Pool:
         self.order = self.order[_curve(self.splats.means[self.order], wave)]
 
     def columns(self, rows: Tensor) -> Columns:
-        """What prices look at."""
+        """The columns that prices look at, of some rows."""
         found = self.table[rows].T.contiguous()
         return Columns(found[:3], found[3:9], found[9], found[10], found[11], found[12:15],
                        self.splats.sh[rows, 1:].flatten(1).T.contiguous())  # fmt: skip
