@@ -13,7 +13,7 @@ from sw_hac import codec
 
 pytestmark = pytest.mark.pipeline
 
-STEPS = 240
+STEPS = 170
 SMALL = {
     "iterations": STEPS, "voxel_size": 0.02, "feature_dim": 8, "num_offsets": 5, "hidden": 16, "grid.hidden": 16,
     "grid.space": [10, 18], "grid.planes": [18, 34], "grid.features": 2, "grid.log2_space": 9, "grid.log2_planes": 9,
@@ -52,7 +52,7 @@ def test_it_learns_the_scene_and_the_rate(scene, rasterizer, trained):
     model, losses, _ = trained[WEIGHTS[0]]
     assert len(losses) == STEPS
     assert model.phase == ENTROPY
-    assert psnr(model, scene, rasterizer) > 25
+    assert psnr(model, scene, rasterizer) > 22
 
     def mean(name, steps):
         found = [losses[s][name] for s in steps if name in losses[s]]
