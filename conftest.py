@@ -7,6 +7,7 @@ from pathlib import Path
 
 import forked_children
 import pytest
+from forked_children import SELDOM
 from hypothesis import HealthCheck, settings
 
 settings.register_profile("patient", max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -56,9 +57,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collection_finish() -> None:
-    """Collect garbage again, but never look at the tests themselves."""
+    """Collect garbage again, but seldom, and never look at the tests themselves: else it is 5 % of all time."""
     gc.collect()
     gc.freeze()
+    gc.set_threshold(SELDOM)
     gc.enable()
 
 

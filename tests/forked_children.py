@@ -58,6 +58,8 @@ OURS = (
     *(entry.value for entry in entry_points(group="splatwizard") if entry.value.startswith("sw_")),
 )  # fmt: skip
 """Modules that nearly every run imports: of others, and of ours."""
+SELDOM = 50_000
+"""Objects after which garbage is looked for, here and in tests: after 700, as usual, it takes 5 % of the time."""
 START = subprocess.run
 
 
@@ -79,19 +81,13 @@ def start_python(*arguments: str, **options: Any) -> Any:
     return started([sys.executable, *arguments], **options)
 
 
-def keep_freed_memory(most: int = 1 << 30) -> None:
-    """Let this process and what it forks keep up to `most` bytes of freed memory; 0: give all of it back, as usual.
-
-    Of the allocator of Linux; elsewhere nothing happens.
-    """
+def keep_freed_memory() -> None:
+    """Let this process and what it forks keep a gigabyte of freed memory for later; of the allocator of Linux alone."""
     libc = ctypes.CDLL(None)
-    if not hasattr(libc, "mallopt"):
-        return
-    trim, pad, mapped = -1, -2, -3  # M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD of malloc.h
-    for option, value in ((trim, most or 1 << 17), (pad, most >> 4), (mapped, 1 << 25 if most else 1 << 17)):
-        libc.mallopt(option, value)
-    if not most:
-        libc.malloc_trim(0)
+    if hasattr(libc, "mallopt"):
+        # M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD of malloc.h
+        for option, value in ((-1, 1 << 30), (-2, 1 << 26), (-3, 1 << 25)):
+            libc.mallopt(option, value)
 
 
 class Forked:
@@ -430,6 +426,7 @@ if __name__ == "__main__":
         importlib.import_module(name)
     sys.meta_path.insert(0, Imported(OURS))
     gc.freeze()  # else the children's first collections copy all its memory
+    gc.set_threshold(SELDOM)
     given = [os.path.abspath(path) for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
     ours = [path for path in sys.path[1:] if path not in given]  # the first is this file's folder
     _become(*_serve(socket.socket(fileno=int(sys.argv[1]))), ours)
