@@ -19,7 +19,7 @@ _workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
 if _workers > 1:
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // _workers)))
 
-# Freed memory is kept for the next tensor: else each large one is mapped anew, page by page, a sixth of all time.
+# Freed memory is kept for the next tensor: else each large one is mapped anew, page by page.
 forked_children.keep_freed_memory()
 
 # Collections of garbage are 40 % of the time in which ten thousand tests are collected; nothing of that is garbage.

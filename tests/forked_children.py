@@ -83,7 +83,7 @@ def start_python(*arguments: str, **options: Any) -> Any:
 
 def keep_freed_memory() -> None:
     """Let this process and what it forks keep a gigabyte of freed memory for later; of the allocator of Linux alone."""
-    libc = ctypes.CDLL(None)
+    libc = ctypes.CDLL(None) if sys.platform == "linux" else None
     if hasattr(libc, "mallopt"):
         # M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD of malloc.h
         for option, value in ((-1, 1 << 30), (-2, 1 << 26), (-3, 1 << 25)):
