@@ -11,21 +11,25 @@ from splatwizard_core.api import TaskLog, UserInputError
 STEPS, FIRST = 30_000, 10_000
 
 
+def stepped(**parts) -> SimpleNamespace:
+    return SimpleNamespace(**{"led": {}, "STEP_POWERS": (1, 1, 1), **parts})
+
+
 def led(size: int, *, power: float, lag: float, off: float = 1.1) -> tuple[float, dict[str, float]]:
     """Bytes at the end of a training whose bytes follow lambda by a power, some steps later; state of the control."""
-    model = SimpleNamespace(led={})
+    model = stepped()
     control = LeadToSize(str(size), "hac", FIRST, STEPS)
     model.bytes = 8e6
     for step in range(control.begin, control.freeze, control.every):
         control.steer(model, lambda: int(off * model.bytes), step, TaskLog())
-        settled = 6e6 * model.led["factor"] ** -power
+        settled = 6e6 * control.factor**-power
         model.bytes *= (settled / model.bytes) ** (control.every / lag)
-    return off * model.bytes, model.led
+    return off * model.bytes, control.state
 
 
 @pytest.fixture(autouse=True)
 def _estimate(monkeypatch):
-    monkeypatch.setattr(lambda_control, "estimated_bytes", lambda model: model.bytes)
+    monkeypatch.setattr(lambda_control, "estimated_bytes", lambda model, result: model.bytes)
 
 
 @pytest.mark.parametrize(("size", "power"), [(5e6, 0.17), (4.5e6, 0.38), (8e6, 0.38), (3.5e6, 0.38)])
@@ -43,24 +47,24 @@ def test_lambda_stays_in_its_range():
 
 def test_real_files_correct_the_estimate_a_few_times():
     encodes = []
-    model = SimpleNamespace(led={}, bytes=1e6)
+    model = stepped(bytes=1e6)
     task = LeadToSize("1MB", "hac", FIRST, STEPS)
-    for step in task.steps[:-1]:
+    for step in task.steps[1:-1]:
         task.steer(model, lambda: encodes.append(1) or 1_000_000, step, TaskLog())
     assert 3 <= len(encodes) <= lambda_control.ENCODES + 1
-    assert (task.steps[0], task.steps[-1]) == (11_000, STEPS)
+    assert (*task.steps[:2], task.steps[-1]) == (1, 11_000, STEPS)
     assert 100 <= len(task.steps) <= 140
 
 
 def test_a_log_has_the_curves():
-    model, log = SimpleNamespace(led={}, bytes=2e6), TaskLog()
+    model, log = stepped(bytes=2e6), TaskLog()
     LeadToSize("1MB", "hac", FIRST, STEPS).steer(model, lambda: 2_000_000, 11_000, log)
     assert set(log.scalars) == {"file bytes", "lambda factor"}
 
 
 def filled(size: int, **parts) -> tuple[int, list[float]]:
     """Bytes of a file of 20,000 fixed ones and 180,000 that fall with the root of the steps, and those factors."""
-    model = SimpleNamespace(led={}, **parts)
+    model = stepped(**parts)
 
     def written() -> int:
         return int(20_000 + 180_000 * model.led["steps"][1] ** -0.5)
@@ -79,7 +83,7 @@ def test_steps_fill_a_size(share: float):
 
 
 def test_features_keep_the_step_that_a_network_has_learnt():
-    _, steps = filled(180_000, channel=object())
+    _, steps = filled(180_000, STEP_POWERS=(0, 1, 1))
     assert steps[0] == 1 < steps[1]
 
 

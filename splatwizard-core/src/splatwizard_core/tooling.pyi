@@ -80,6 +80,7 @@ from splatwizard_core.runs.directory import OWN_FILES as OWN_FILES
 from splatwizard_core.runs.directory import RunRequest as RunRequest
 from splatwizard_core.runs.directory import run_directory as run_directory
 from splatwizard_core.runs.encode import encode as encode
+from splatwizard_core.runs.encode import filled_writer as filled_writer
 from splatwizard_core.runs.file_needs import missing_plugin as missing_plugin
 from splatwizard_core.runs.identity import recorded_hash as recorded_hash
 from splatwizard_core.runs.measure import open_subject as open_subject
@@ -109,4 +110,5 @@ from splatwizard_core.training.params import SceneParams as SceneParams
 from splatwizard_core.training.pipeline import TrainingRun as TrainingRun
 from splatwizard_core.training.pipeline import TrainingStopped as TrainingStopped
 from splatwizard_core.training.scheduler import build_schedulers as build_schedulers
+from splatwizard_core.training.stage import PlannedTask as PlannedTask
 from splatwizard_native.errors import ForeseenError as ForeseenError

@@ -4,6 +4,7 @@ from pydantic import Field
 from sw_gaussians.choices import CodecChoice
 from sw_gaussians.config import GaussianTraining
 from sw_gaussians.density.choice import DensityChoice
+from sw_gaussians.sized import Capped
 from sw_gaussians.start import Rotation
 from sw_gaussians.surface_losses import NormalTerm
 
@@ -32,7 +33,7 @@ class SurfaceTraining(Params):
     normal_after: int = Field(7_000, ge=0, description="last step without the normal loss")
 
 
-class TwoDGSConfig(GaussianTraining):
+class TwoDGSConfig(Capped, GaussianTraining):
     """Everything that can be set for 2DGS."""
 
     sh_degree: int = Field(3, ge=0, le=3, description="highest degree of the spherical harmonics")

@@ -7,7 +7,7 @@ from pydantic import Field
 from sw_gaussians.choices import CodecChoice, Moved
 from sw_gaussians.config import GaussianTraining
 from sw_gaussians.fast.fused_adam import MIN_FUSED_GAUSSIANS
-from sw_gaussians.sized import Capped
+from sw_gaussians.sized import FILLING, Capped
 
 from splatwizard_core.api import InputFile
 from sw_codecs.models.settings import QuantizedSettings
@@ -19,6 +19,7 @@ MODES = {"exact": "gaussians-exact", "quantized": "gaussians-quantized"}
 class ThreeDGSConfig(Capped, GaussianTraining):
     """Configuration of 3DGS."""
 
+    FILLED_BY: ClassVar[str] = FILLING
     OLDER: ClassVar[Mapping[str, Moved]] = {
         f"codec.{name}": Moved((f"codec.settings.{name}",), field.default, MODES["quantized"])
         for name, field in QuantizedSettings.model_fields.items()

@@ -10,7 +10,7 @@ from sw_gaussians.choices import Choosing, CodecChoice, PrunerChoice
 from sw_gaussians.finetune.fine_tuning import FineTuningRates, FineTuningStage, collect_anew, windows_before
 from sw_gaussians.finetune.pruning import PruneByScore, PruneToCount
 from sw_gaussians.method import GaussianMethod
-from sw_gaussians.sized import Sized
+from sw_gaussians.sized import FILLING, Sized
 
 if TYPE_CHECKING:
     from splatwizard_core.api import OptimizationParams, PipelineParams, PluginManager, Scheduler, Stage
@@ -42,12 +42,20 @@ class Pruned3DGSConfig(Sized, Choosing):
     """Everything that can be set for pruned-3dgs."""
 
     FULL_ITERATIONS: ClassVar[int] = 10_000
+    FILLED_BY: ClassVar[str] = FILLING
 
+    gaussians: int = Field(0, ge=0, description="the same as `prune.count`; 0: that says")
     iterations: int = Field(10_000, ge=1, description="steps after the trained scene")
     prune: Prune = Field(Prune(), description="what is removed when")
     lr: Rates = Field(Rates(), description="step sizes")
     lambda_dssim: float = Field(0.2, ge=0, le=1, description="weight of 1 - SSIM in the loss; the rest is that of L1")
     codec: CodecChoice = Field(CodecChoice(name="gaussians-exact"), description="what writes the file")
+
+    def of_size(self, sources: Mapping[str, str]) -> dict[str, Any]:
+        changed = super().of_size(sources)
+        if not self.gaussians or "prune.count" in sources:
+            return changed
+        return {**changed, "prune": self.prune.model_copy(update={"count": self.gaussians})}
 
 
 class PruneStage(FineTuningStage):

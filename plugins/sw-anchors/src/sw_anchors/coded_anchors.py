@@ -44,6 +44,8 @@ class CodedAnchors(AnchorModel):
 
     ROWS = (*AnchorModel.ROWS, "mask_logits")
 
+    STEP_POWERS: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """By group, of the factor by which quantiser steps fill a size; 0: a network has learnt values of one step."""
     RATE_OF: ClassVar[Literal["visible", "all"]] = "visible"
     """Anchors that the rate samples from: the visible ones, or all (with separate noise)."""
 
@@ -71,7 +73,7 @@ class CodedAnchors(AnchorModel):
         self.base_steps = base_steps
         self.sample, self.smallest_probability = sample, smallest_probability
         self.scale_floor = scale_floor
-        self.led: dict[str, Any] = {}  # by a task that leads the training to a size: "factor" of lambda, "steps"
+        self.led: dict[str, Any] = {}  # by a task that leads the training to a size: "steps", factors by group
         self._lattice: tuple[tuple[Any, ...], Tensor, Tensor] | None = None
         self._steps: dict[tuple[Any, ...], Tensor] = {}
 

@@ -93,6 +93,7 @@ class AnchorLoss(Params):
 class AnchorParams(OptimizationParams):
     """Base of the hyper-parameters of an anchor method."""
 
+    REFUSES: ClassVar = {"gaussians": "it trains anchors, whose offsets are its Gaussians: --size bounds the file"}
     voxel_size: float = Field(0.001, description="edge of an anchor's cell, world units; <= 0: from the points")
     num_offsets: int = Field(10, ge=1, le=64, description="Gaussians per anchor")
     feature_dim: int = Field(50, ge=1, le=256, description="numbers in an anchor's feature")

@@ -208,6 +208,7 @@ class CodedAnchorStage(AnchorStage):
 
     opt: CodedAnchorParams
     trains = CodedAnchors
+    leading: Any = None  # task `lead-to-size` of a training to a size, by whose `factor` bits cost more
 
     def begin(self, context: StageContext) -> SplatModel:
         model = super().begin(context)

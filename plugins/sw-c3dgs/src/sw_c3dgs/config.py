@@ -5,6 +5,7 @@ from typing import ClassVar
 from pydantic import Field
 from sw_gaussians.choices import Choosing, CodecChoice
 from sw_gaussians.finetune.fine_tuning import FineTuningRates
+from sw_gaussians.sized import Sized
 
 from splatwizard_core.api import Params
 from sw_codecs.codebooks.sharing import Training
@@ -57,7 +58,7 @@ class Rates(FineTuningRates):
         return found
 
 
-class C3DGSConfig(Choosing):
+class C3DGSConfig(Sized, Choosing):
     """Everything that can be set for C3DGS."""
 
     FULL_ITERATIONS: ClassVar[int] = 5_000

@@ -8,6 +8,7 @@ over the rows in the same way (`walk`); only what happens to a block of symbols 
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -182,6 +183,9 @@ def _settled_context(model: CatAnchors, geometry: AnchorGeometry, config: CatCon
         shapes = [plane.shape for plane in context.triplane.initial(resolution, torch.Generator())]
         _use_integers(context, [np.zeros(each, np.int64) for each in shapes])
     context.fold_units()
+    factors = model.led.get("steps", (1, 1, 1))
+    _, scales, offsets = (base * factor for base, factor in zip(context.shape.base_steps, factors, strict=True))
+    context.shape = replace(context.shape, base_steps=(1.0, scales, offsets))
     return context
 
 

@@ -144,6 +144,7 @@ class CatConfig(Choosing, CodedAnchorParams):
     steps: Steps = Field(Steps(), description="base steps of the quantisers")
     context: Context = Field(Context(), description="the models that predict attributes")
     rate_term: RateTerm = Field(RateTerm(), description="rate term and masks")
+    size: str = Field("", description="bytes of the file at most: 5MB; lambda is led to it; empty: as lambda has it")
     codec: Codec = Field(Codec(), description="what writes the file")
 
     @property

@@ -69,7 +69,11 @@ class Cat3DGS(Method):
         )  # fmt: skip
 
     def stages(self) -> Sequence[Stage]:
-        return [CatStage(self.config, pictures=self.config.pictures.load(self.plugins))]
+        stage = CatStage(self.config, pictures=self.config.pictures.load(self.plugins))
+        if self.config.size:
+            lead, first = self.plugins.tasks.load("lead-to-size"), stage.at(self.config.phases.planes)
+            lead(self.config.size, self.name, first, stage.iterations).lead(stage)
+        return [stage]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         if not isinstance(model, CatAnchors):

@@ -31,6 +31,8 @@ class CatAnchors(CodedAnchors):
 
     view_weights: Tensor
 
+    STEP_POWERS = (0.0, 1.0, 1.0)
+
     def __init__(self, *tensors: Tensor, context: CatContext, view_factor: float = 1.0, **kwargs: Any) -> None:
         """Tensors and other arguments as of CodedAnchors."""
         super().__init__(*tensors, base_steps=context.shape.base_steps, **kwargs)

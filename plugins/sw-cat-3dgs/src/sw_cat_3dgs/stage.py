@@ -135,14 +135,15 @@ class CatStage(CodedAnchorStage):
     def extra_loss(self, model: Any, result: RenderResult, step: int) -> dict[str, Weighted]:
         """Return the terms of masks, of the anchors' rate and of the planes' rate, each from its phase on."""
         rate = self.opt.rate_term
+        weight = rate.weight * (1.0 if self.leading is None else self.leading.factor)
         terms: dict[str, Weighted] = {}
         if step >= self.at(self.opt.phases.quantize):
-            weight = max(rate.mask_floor, rate.mask_factor * rate.weight)
-            terms["masks"] = weight, torch.sigmoid(model.mask_logits).mean()
+            masks = max(rate.mask_floor, rate.mask_factor * weight)
+            terms["masks"] = masks, torch.sigmoid(model.mask_logits).mean()
         if "rate" in result.extras:
-            terms["rate"] = rate.weight, result.extras["rate"].bits
+            terms["rate"] = weight, result.extras["rate"].bits
         if model.context.rounded:
-            terms["triplane"] = rate.weight * rate.triplane, self._plane_bits(model)
+            terms["triplane"] = weight * rate.triplane, self._plane_bits(model)
         return terms
 
     def _plane_bits(self, model: CatAnchors) -> Tensor:

@@ -11,6 +11,7 @@ from sw_gaussians.choices import Choice, Choosing, Moved, PrunerChoice
 from sw_gaussians.finetune.distillation import DistillLoss
 from sw_gaussians.finetune.fine_tuning import FineTuningRates
 from sw_gaussians.older_keys import within
+from sw_gaussians.sized import CappedBase
 
 from splatwizard_core.api import Params
 
@@ -80,10 +81,11 @@ class Steps(Params):
 _SHARED = {"training": "ema", "size": 8192, "iterations": 1_000, "batch": 80_000}
 
 
-class ChimeraConfig(Choosing):
+class ChimeraConfig(CappedBase, Choosing):
     """Everything that can be set for ChimeraGS."""
 
-    ENCODING: ClassVar[tuple[str, ...]] = ("codec", "steps", "xyz", "arrays", "prefer", "vq")
+    BASE: ClassVar[str] = "student"
+    ENCODING: ClassVar[tuple[str, ...]] = ("codec", "steps", "xyz", "arrays", "prefer", "vq", "size")
     OLDER: ClassVar[Mapping[str, Moved]] = {
         "vq.codec": Moved(("codec.name",), "importance-vq"),
         "vq.ratio2": Moved(("codec.sh2.ratio",), 0.8, "importance-vq"),

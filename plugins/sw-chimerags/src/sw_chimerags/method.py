@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from sw_gaussians.sized import fill
+
 from splatwizard_core.api import ConfigError, Method, create_method
 from sw_chimerags import file
 from sw_chimerags.config import ChimeraConfig
@@ -71,6 +73,9 @@ class ChimeraGS(Method):
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         if not isinstance(model, MaskedGaussians):
             raise TypeError(f"chimerags encodes what it has distilled, not a {type(model).__name__}")
+        if self.config.size:
+            fill(self, model, writer)
+            return
         codec = self.config.codec
         groups = {"sh2": codec.sh2, "sh3": codec.sh3}
         file.encode(

@@ -1,7 +1,7 @@
 """Hyper-parameters of Compact3DGS. Defaults are those of the authors' code for real scenes."""
 
 from collections.abc import Mapping
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 from sw_gaussians.config import GaussianTraining, Loss
@@ -10,8 +10,9 @@ from sw_gaussians.density.choice import DensityChoice
 from sw_gaussians.named_blocks import Choosing, Moved, OwnCodec
 from sw_gaussians.older_keys import DENSIFY
 from sw_gaussians.pictures import Pictures
+from sw_gaussians.sized import Capped
 
-from splatwizard_core.api import OptimizationParams, Params
+from splatwizard_core.api import Params
 
 
 class LearningRates(Params):
@@ -50,6 +51,12 @@ class Grid(Params):
     def log2_table(self) -> int:
         """Logarithm of the most entries of a level."""
         return max(self.log2_size - self.halvings, 3)
+
+    @property
+    def sizes(self) -> dict[str, Any]:
+        """Arguments of a `ColorField` that say how large its grid is."""
+        names = ("levels", "features", "coarsest", "growth")
+        return {**{name: getattr(self, name) for name in names}, "log2_size": self.log2_table}
 
 
 class Network(Params):
@@ -90,7 +97,7 @@ class Codec(OwnCodec):
     settings: FileSettings = Field(FileSettings(), description="settings of the file")
 
 
-class Compact3DGSConfig(Choosing, OptimizationParams):
+class Compact3DGSConfig(Capped, Choosing):
     """Everything that can be set for Compact3DGS."""
 
     OLDER: ClassVar[Mapping[str, Moved]] = DENSIFY

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from sw_gaussians.sized import fill, hold_size
 from sw_gaussians.start import gaussians_from_points
 
 from splatwizard_core.api import ConfigError, Method, SceneError
@@ -50,8 +51,7 @@ class Compact3DGS(Method):
         start = gaussians_from_points(scene.points, max_sh_degree=0, **values)
         try:
             color = ColorField(
-                levels=c.grid.levels, features=c.grid.features, coarsest=c.grid.coarsest, growth=c.grid.growth,
-                log2_size=c.grid.log2_table, hidden=c.network.hidden, generator=generator,
+                **c.grid.sizes, hidden=c.network.hidden, generator=generator,
             )  # fmt: skip
         except ValueError as error:
             raise ConfigError(f"grid: {error}: lower grid.growth or grid.levels", key="grid.growth") from error
@@ -69,12 +69,17 @@ class Compact3DGS(Method):
                 f"no entropy coder is called '{coder}'; installed: {', '.join(known)}", key="codec.settings.coder"
             )
         config: Compact3DGSConfig = self.config
+        grid = ColorField.numbers(**config.grid.sizes)
+        hold_size(config.size, grid // 8, f"the {grid:,} numbers of its grid (grid.log2_size, grid.halvings)")
         control, pictures = config.density.load(self.plugins), config.pictures.load(self.plugins)
         return [Compact3DGSStage(config, control, pictures=pictures)]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         if not isinstance(model, CompactGaussians):
             raise TypeError(f"compact3dgs encodes its own Gaussians, not a {type(model).__name__}")
+        if self.config.size:
+            fill(self, model.in_file(), writer)
+            return
         file.encode(model, writer, self.plugins, self.config.codec.settings)
 
     def decode(self, reader: ContainerReader) -> SplatModel:

@@ -78,6 +78,10 @@ class CompactGaussians(VolumeMaskedGaussians):
         )  # fmt: skip
         return drawn(masked, self.color, None, camera, rasterizer)
 
+    def in_file(self) -> CompactGaussians:
+        """Return a copy with the Gaussians that the masks leave in the file."""
+        return self.with_rows(torch.nonzero(self.rate.exact(self.mask_logits)).squeeze(1))
+
     def unit_quats(self) -> Tensor:
         """[N,4] of length 1."""
         return F.normalize(self.quats, dim=1, eps=1e-12)

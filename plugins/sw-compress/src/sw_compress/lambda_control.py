@@ -1,4 +1,4 @@
-"""Trainings to a size of the file: lambda follows the bytes on the way, quantiser steps fill the last per cent.
+"""Trainings to a size of the file: lambda follows the bytes on the way; quantiser steps or rows fill the last per cent.
 
 Where the rate counts already, a larger lambda makes a smaller file within some hundred steps. So the estimated bytes
 are led from where they are to the goal, along a curve that falls (or rises) by equal factors; no training begins anew.
@@ -6,16 +6,30 @@ are led from where they are to the goal, along a curve that falls (or rises) by 
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from sw_anchors.coded_anchors import CodedAnchors
 from sw_anchors.noisy_values import Noise
 from sw_gaussians.byte_sizes import parse_size
 
-from splatwizard_core.api import ContainerWriter, Method, OptimizationParams, TaskLog, UserInputError
-from splatwizard_core.tooling import load_plugins
+from splatwizard_core.api import (
+    Method,
+    OptimizationParams,
+    RenderResult,
+    Scene,
+    SplatModel,
+    SplatOptimizer,
+    TaskLog,
+    UserInputError,
+)
+from splatwizard_core.tooling import PlannedTask, filled_writer, load_plugins
+from sw_compress.cutting import rows_by_worth, rows_that_fit
+
+logger = logging.getLogger(__name__)
 
 GOAL = 0.98
 """Share of the size that a training is led to."""
@@ -33,17 +47,45 @@ SAMPLE = 20_000
 """Anchors that the bytes are estimated from."""
 FILLED = 0.985
 """Share of the size that the last choice aims at, and which is good enough where steps are as trained."""
+LEAST_FILLED = 0.97
+"""Share of the size below which a file is told to be too small."""
 LEAST, MOST_STEP = 0.5, 8.0
 """Bounds of the factor on the quantiser steps."""
 SLOPE, SLOPES = -0.5, (-2.0, -0.02)
 """Power of the factor that bytes fall with, before two files tell it; bounds."""
 TRIES = 8
-HEADER = 1_000
-"""Bytes that the header may grow by when the file is closed: what a reader needs."""
+HALVES = ("mlp_", "channel.", "context.network.", "context.slices.")
+"""Beginnings of the names of weights that take two bytes in a file, or four."""
+LARGER = 1.03
+"""Share of the size that a training whose rows are cut at its end is led to."""
+DRIFT = 0.993
+"""Share of the size that its file may have before its last changes."""
+HEADER = 200
+"""Bytes that the header may grow by when the file is closed."""
+
+
+@runtime_checkable
+class Stepped(Protocol):
+    """A model whose file has quantiser steps by group, multiplied by `led["steps"]`."""
+
+    led: dict[str, Any]
+    STEP_POWERS: tuple[float, ...]
+    """By group, of the factor by which steps fill a size; 0: a network has learnt to read values of one step."""
+
+
+def estimated_bytes(model: SplatModel, result: RenderResult | None = None) -> float | None:
+    """Bytes of the attributes by the rate of training; None at a step that counts none.
+
+    `extras["bits"]` of a render are the bits of a row, in the mean. Positions, masks and networks are not counted.
+    """
+    if isinstance(model, CodedAnchors):
+        return anchor_bytes(model)
+    bits = None if result is None else result.extras.get("bits")
+    return None if bits is None else float(bits) * model.num_rows / 8
 
 
 @torch.no_grad()
-def estimated_bytes(model: CodedAnchors) -> float:
+def anchor_bytes(model: CodedAnchors) -> float:
     """Bytes of the attributes by the rate model, without noise; positions, masks and networks are not counted."""
     kept = torch.nonzero(model.kept()).squeeze(1)
     rows = kept[:: max(1, len(kept) // SAMPLE)]
@@ -59,61 +101,110 @@ def estimated_bytes(model: CodedAnchors) -> float:
 
 
 class LeadToSize:
-    """Schedule task that changes lambda so that the file comes to a size, and in the last step the quantiser steps.
+    """Schedule task that changes lambda so that the file comes to a size, and fills the size at its last step.
 
     size    as people write it
-    method  name of the method: one whose model is a CodedAnchors, and whose lambda and steps follow its `led`
+    method  name of the method, whose loss multiplies lambda by `factor`
     first   step from which the rate counts
-    last    step of the training
+    last    step that fills: the end of the training, or where a model that is not `Stepped` fixes its integers next
+    raster  what the file asks of a renderer, for the worth of rows
+    least   bytes that every file has, where they are known
 
-    State is in `model.led`: `factor` of lambda, `ratio` of real bytes to estimated ones, `began`: bytes at the first
-    change, `steps`: factors of the quantiser steps by group. Raises UserInputError for what is no size.
+    A model that is `Stepped` is filled by its quantiser steps, any other by its rows. Raises UserInputError for what is
+    no size, and for one below `least`.
     """
 
-    def __init__(self, size: str, method: str, first: int, last: int) -> None:
-        self.size, self.method, self.last = parse_size(size), method, last
+    def __init__(
+        self, size: str, method: str, first: int, last: int, *, raster: Mapping[str, Any] | None = None, least: int = 0
+    ) -> None:
+        self.size, self.method, self.last, self.raster = parse_size(size), method, last, dict(raster or {})
+        self.asked = size
         self.begin = first + max(1, round(BEGIN * (last - first)))
         self.arrive, self.freeze = (max(self.begin + 1, round(share * last)) for share in (ARRIVE, FREEZE))
         self.every = max(1, (self.freeze - self.begin) // CHANGES)
+        self.state: dict[str, float] = {}
+        self.hold(least)
+
+    def lead(self, stage: Any) -> None:
+        """Join the plan of a stage, as its `leading`, by whose `factor` its loss multiplies lambda."""
+        stage.leading = self
+        stage.extra_tasks = (*stage.extra_tasks, PlannedTask(False, self.steps, self, name="lead lambda to the size"))
 
     @property
     def steps(self) -> list[int]:
         """Steps at which it runs."""
-        return [*range(self.begin, self.freeze, self.every), self.last]
+        return [1, *range(self.begin, self.freeze, self.every), self.last]
 
-    def __call__(self, model: CodedAnchors, opt: OptimizationParams, step: int, log: TaskLog) -> None:
+    @property
+    def factor(self) -> float:
+        """Factor of lambda now."""
+        return self.state.get("factor", 1.0)
+
+    def state_dict(self) -> dict[str, float]:
+        """`factor` of lambda, `ratio` of real bytes to estimated ones, `began`: bytes at the first change."""
+        return dict(self.state)
+
+    def load_state_dict(self, state: dict[str, float]) -> None:
+        self.state = dict(state)
+
+    def hold(self, least: int) -> None:
+        """Raise UserInputError if the networks alone are larger: at the start of a training, which would be in vain."""
+        if least > self.size:
+            raise UserInputError(
+                f"--size {self.asked}: its networks alone have {least:,} bytes: ask for more, or make them smaller"
+            )
+
+    def __call__(
+        self, model: SplatModel, opt: OptimizationParams, optimizer: SplatOptimizer, scene: Scene,
+        result: RenderResult, step: int, log: TaskLog,
+    ) -> None:  # fmt: skip
+        if step == 1:
+            weights = (p.numel() for name, p in model.named_parameters() if name.startswith(HALVES))
+            self.hold(2 * sum(weights))
+            return
         plugins = load_plugins()
-        method = plugins.methods.load(self.method)(plugins, opt)
-        if step < self.last:
-            self.steer(model, lambda: written_bytes(method, model), step, log)
-        else:
-            self.fill(model, lambda: written_bytes(method, model), log)
+        method: Method = plugins.methods.load(self.method)(plugins, opt)
+        method.scene = scene
 
-    def steer(self, model: CodedAnchors, written: Callable[[], int], step: int, log: TaskLog) -> None:
+        def written(part: SplatModel = model) -> int:
+            return len(filled_writer(method, part, self.raster, scene.origin)[0].to_bytes())
+
+        if step < self.last:
+            self.steer(model, written, step, log, result)
+        elif isinstance(model, Stepped):
+            self.fill(model, written, log)
+        else:
+            self.cut(method, model, optimizer, written, log)
+
+    def steer(
+        self, model: SplatModel, written: Callable[[], int], step: int, log: TaskLog, result: RenderResult | None = None
+    ) -> None:
         """Change lambda by how far the file is from where it should be at this step.
 
         written     bytes of the file that the model would have now
         """
-        state, estimate = model.led, max(estimated_bytes(model), 1.0)
+        state, estimate = self.state, estimated_bytes(model, result)
+        if not estimate:
+            return
         encodes = max(1, (self.freeze - self.begin) // (ENCODES * self.every)) * self.every
-        if "ratio" not in state or (step - self.begin) % encodes == 0:
-            state["ratio"] = written() / estimate
+        due = "ratio" not in state or step - state.get("encoded", 0.0) >= encodes
+        if due:
+            state["ratio"], state["encoded"] = written() / estimate, float(step)
         now = state["ratio"] * estimate
         began = state.setdefault("began", now)
         way = min((step - self.begin) / (self.arrive - self.begin), 1.0)
-        goal = began ** (1 - way) * (GOAL * self.size) ** way
+        end = (GOAL if isinstance(model, Stepped) else LARGER) * self.size
+        goal = began ** (1 - way) * end**way
         change = min(max(GAIN * math.log(now / goal), -MOST), MOST)
-        state["factor"] = min(max(state.get("factor", 1.0) * math.exp(change), 1 / RANGE), RANGE)
+        state["factor"] = min(max(self.factor * math.exp(change), 1 / RANGE), RANGE)
         log.scalar("file bytes", now)
         log.scalar("lambda factor", state["factor"])
 
-    def fill(self, model: CodedAnchors, written: Callable[[], int], log: TaskLog) -> None:
+    def fill(self, model: Stepped, written: Callable[[], int], log: TaskLog) -> None:
         """Choose quantiser steps with which the file fills the size. Raises UserInputError that names the smallest."""
-        # A network has learnt to read features in the step that they have: where there is one, it stays.
-        group = (0.0, 1.0, 1.0) if getattr(model, "channel", None) is not None else (1.0, 1.0, 1.0)
 
         def bytes_at(factor: float) -> int:
-            model.led["steps"] = [factor**power for power in group]
+            model.led["steps"] = [factor**power for power in model.STEP_POWERS]
             return written() + HEADER
 
         known = [(1.0, bytes_at(1.0))]
@@ -137,16 +228,34 @@ class LeadToSize:
                 f"no file of {self.size:,} bytes was found: the smallest of this training has "
                 f"{min(size for _, size in known):,}"
             )
-        bytes_at(max(fitting, key=lambda each: each[1])[0])
-        log.scalar("factor of the quantiser steps", model.led["steps"][1])
+        self._tell(bytes_at(max(fitting, key=lambda each: each[1])[0]))
+        log.scalar("factor of the quantiser steps", model.led["steps"][-1])
 
+    def cut(
+        self, method: Method, model: SplatModel, optimizer: SplatOptimizer, written: Callable[[SplatModel], int],
+        log: TaskLog,
+    ) -> None:  # fmt: skip
+        """Remove the rows that training views miss least, so that the file fits. Raises UserInputError if none may."""
+        size, whole = int(DRIFT * self.size) - HEADER, written(model)
+        if whole <= size:
+            self._tell(whole)
+            return
+        order = rows_by_worth(method, model, self.raster)
+        count = rows_that_fit(model.num_rows, whole, size, lambda rows: written(model.with_rows(order(rows))))
+        if not count:
+            raise UserInputError(f"no file of {self.size:,} bytes was found: one row is too much")
+        kept = torch.zeros(model.num_rows, dtype=torch.bool, device=model.device)
+        kept[order(count)] = True
+        log.say(f"removed {model.num_rows - count:,} of {model.num_rows:,} {model.ROW_LABEL} for --size {self.asked}")
+        optimizer.keep_rows(model, kept)
 
-def written_bytes(method: Method, model: CodedAnchors) -> int:
-    """Bytes of the file that a model would have now, but for what its header says of packages."""
-    writer = ContainerWriter(method.name, method.version)
-    with torch.no_grad():
-        method.encode(model, writer)
-    return len(writer.to_bytes())
+    def _tell(self, found: int) -> None:
+        """Say it where the file is too small, whatever lambda."""
+        if found < LEAST_FILLED * self.size:
+            logger.warning(
+                "--size %s: the largest file of this training has %s bytes (lambda times %.3f): a higher --rate, or "
+                "more start points, make larger ones", self.asked, f"{found:,}", self.factor,
+            )  # fmt: skip
 
 
 def _slope(a: tuple[float, int], b: tuple[float, int]) -> float:

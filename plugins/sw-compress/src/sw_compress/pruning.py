@@ -6,15 +6,15 @@ neighbours, and what is left is judged anew.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
 
 import torch
 from sw_gaussians.morton import interleave
 from sw_gaussians.removal import removal_costs
 from torch import Tensor
 
-from splatwizard_core.api import Camera, GaussianModel, track
+from splatwizard_core.api import Camera, track
 from sw_compress.rows import select
 
 if TYPE_CHECKING:
@@ -33,15 +33,18 @@ SEEN = 1 / 255
 class Pruning:
     """Removals in order, made as far as they are asked for: what `rows` returns for fewer is a part of that for more.
 
+    model           a GaussianModel, or another whose rows are what is drawn, with `means`
     cameras         that judge
     keeps_unseen    whether Gaussians that none of them shows stay: cameras that were made up prove nothing; else they
                     go first
+    select          the model with some rows alone
     """
 
     def __init__(
-        self, model: GaussianModel, cameras: Sequence[Camera], rasterizer: Rasterizer, *, keeps_unseen: bool = True
-    ) -> None:
-        self._model, self._cameras, self._rasterizer = model, list(cameras), rasterizer
+        self, model: Any, cameras: Sequence[Camera], rasterizer: Rasterizer, *, keeps_unseen: bool = True,
+        select: Callable[[Any, Tensor], Any] = select,
+    ) -> None:  # fmt: skip
+        self._model, self._cameras, self._rasterizer, self._select = model, list(cameras), rasterizer, select
         self.keeps_unseen = keeps_unseen
         self._left = torch.arange(model.num_rows, device=model.device)
         self._gone: list[Tensor] = []
@@ -97,7 +100,7 @@ class Pruning:
 
     def _score(self) -> None:
         """Judge what is left: infinite for what may not go, below zero for what is not seen and may."""
-        part = self._model if not self._gone else select(self._model, self._left)
+        part = self._model if not self._gone else self._select(self._model, self._left)
         with track(f"judge {len(self._left):,} Gaussians", total=len(self._cameras), unit="views") as bar:
             costs = removal_costs(
                 lambda camera: part.gaussians(camera.to(part.device), self._rasterizer),

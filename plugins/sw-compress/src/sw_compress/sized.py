@@ -17,6 +17,7 @@ from sw_gaussians.surfels import refuse_surfels
 from splatwizard_core.api import GaussianModel, Params, RasterOptions
 from splatwizard_core.tooling import NegotiatedRasterizer, say
 from sw_compress.coders import PRECISE_FROM, Quantized
+from sw_compress.cutting import SizeFilling
 from sw_compress.filling import fill
 from sw_compress.measuring import Errors
 from sw_compress.pruning import Pruning
@@ -28,7 +29,7 @@ from sw_compress.stages import Stages
 from sw_compress.views import made_up_views, training_views
 
 if TYPE_CHECKING:
-    from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager, Scene
+    from splatwizard_core.api import ContainerReader, ContainerWriter, Method, PluginManager, Scene, SplatModel
 
 
 class SizedSettings(Params):
@@ -84,6 +85,10 @@ class Sized:
         with tempfile.TemporaryDirectory(prefix="sw-compress-") as folder:
             filled = fill(search, self._size, Path(folder) / "scene.swz", Stages(), say)
         return filled.choice.model, coder.choice(filled.choice.allocation.levels)
+
+    def fill(self, method: Method, model: SplatModel, writer: ContainerWriter) -> None:
+        """Write a model by a method with a `size`; `sw_gaussians.sized.fill` says how."""
+        writer.take(SizeFilling(method, model, writer).found())
 
     def encode(self, model: GaussianModel, writer: ContainerWriter) -> None:
         model, codec = self.chosen(model, writer.method, writer.raster, None)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from sw_gaussians.camera_files import read_cameras
 from sw_gaussians.made_up_cameras import plausible_cameras
 
-from splatwizard_core.api import Camera, GaussianModel, UserInputError
+from splatwizard_core.api import Camera, GaussianModel, SplatModel, UserInputError
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Rasterizer, Scene
@@ -59,7 +59,7 @@ def views_of_file(path: Path) -> Views:
     return Views(path.name, "given", rest, chosen[::2], chosen[1::2])
 
 
-def training_views(model: GaussianModel, scene: Scene) -> Views:
+def training_views(model: SplatModel, scene: Scene) -> Views:
     """Some training cameras of a scene, evenly spread: as many as would be made up."""
     cameras = [view.camera for view in scene.train]
     found = [cameras[i] for i in _even(len(cameras), min(_usual(model), len(cameras)))]
@@ -68,7 +68,7 @@ def training_views(model: GaussianModel, scene: Scene) -> Views:
     return Views(scene.name, "training", fit or found, [found[i] for i in sorted(judge)], [])
 
 
-def _usual(model: GaussianModel) -> int:
+def _usual(model: SplatModel) -> int:
     device = model.device.type
     return min(max(int(DRAWN[device] / model.num_rows), LEAST[device]), MOST[device])
 

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING
 
-from splatwizard_core.api import GaussianModel, Method, PluginError, SceneError
+import torch
+
+from splatwizard_core.api import ContainerWriter, GaussianModel, Method, PluginError, SceneError
 from sw_gaussians.choices import CodecChoice
-from sw_gaussians.sized import Filling
+from sw_gaussians.sized import FILLING, Filling, fill, hold_size
 from sw_gaussians.start import gaussians_from_points, start_points
 from sw_gaussians.surfels import SurfelModel, state_surface, stated_surface
 
 if TYPE_CHECKING:
-    import torch
-
     from splatwizard_core.api import (
         ContainerReader,
-        ContainerWriter,
         OptimizationParams,
         PluginManager,
         Scene,
@@ -45,7 +45,11 @@ class GaussianMethod(Method):
                 f"method '{self.name}' cannot be used: `codec` of its {type(config).__name__} must be a CodecChoice of "
                 "sw_gaussians.choices; its author has to change that"
             )
-        codec.provider(plugins, "codec.name")(plugins, **codec.settings)
+        provider = codec.provider(plugins, "codec.name")
+        provider(plugins, **codec.settings)
+        if size := str(getattr(config, "size", "")):
+            name = getattr(provider, "WRITES", codec.name)
+            hold_size(size, _least(plugins, self.name, name), "header and sections of a file")
 
     def create_model(self, scene: Scene, generator: torch.Generator) -> SplatModel:
         """Return one Gaussian for each start point, with bands up to `sh_degree` of the config, or 3.
@@ -66,6 +70,9 @@ class GaussianMethod(Method):
         if not isinstance(model, GaussianModel):
             raise TypeError(f"{self.name} encodes a GaussianModel, not a {type(model).__name__}")
         codec: CodecChoice = self.config.codec
+        if getattr(self.config, "size", "") and codec.name != FILLING:
+            fill(self, model, writer)
+            return
         filling = codec.provider(self.plugins, "codec.name")(self.plugins, **codec.settings)
         if isinstance(filling, Filling):
             model, codec = filling.chosen(model, self.name, writer.raster, self.scene)
@@ -84,3 +91,13 @@ class GaussianMethod(Method):
     def codec_of(self, reader: ContainerReader) -> str:
         """Return the name of the codec that the header of a file states. Raises BitstreamError."""
         return reader.text(HEADER_KEY, choices=self.plugins.gaussian_codecs.names)
+
+
+@functools.cache
+def _least(plugins: PluginManager, method: str, codec: str) -> int:
+    """Return bytes of a file of one Gaussian by a codec."""
+    writer, one = ContainerWriter(method, 1), torch.zeros(1, 3)
+    model = GaussianModel(one, one[:, None], one[:, None].repeat(1, 15, 1), one[:, 0], one, torch.eye(4)[:1])
+    with torch.no_grad():
+        plugins.gaussian_codecs.load(codec)(plugins).encode(model, writer)
+    return len(writer.to_bytes())

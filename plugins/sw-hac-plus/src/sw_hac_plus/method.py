@@ -70,7 +70,7 @@ class HACPlus(Method):
         stage = HACPlusStage(self.config, pictures=self.config.pictures.load(self.plugins))
         if self.config.size:
             lead, first = self.plugins.tasks.load("lead-to-size"), stage.at(self.config.phases.entropy)
-            stage.leading = lead(self.config.size, self.name, first, stage.iterations)
+            lead(self.config.size, self.name, first, stage.iterations).lead(stage)
         return [stage]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:

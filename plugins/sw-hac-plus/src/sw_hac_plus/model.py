@@ -42,6 +42,7 @@ class HACPlusAnchors(HACAnchors):
         super().__init__(*tensors, further=0 if channel is None else tensors[1].shape[1], **kwargs)
         self.channel = None if channel is None else channel.to(self.features)
         self.anchor_gradient = anchor_gradient
+        self.STEP_POWERS = (1.0 if channel is None else 0.0, 1.0, 1.0)
 
     @property
     def rate_model(self) -> HACPlusRateModel:

@@ -40,7 +40,7 @@ class HAC(Method):
         stage = HACStage(self.config, pictures=self.config.pictures.load(self.plugins))
         if self.config.size:
             lead, first = self.plugins.tasks.load("lead-to-size"), stage.at(self.config.phases.entropy)
-            stage.leading = lead(self.config.size, self.name, first, stage.iterations)
+            lead(self.config.size, self.name, first, stage.iterations).lead(stage)
         return [stage]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:

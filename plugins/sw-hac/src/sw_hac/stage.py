@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sw_anchors.coded_anchors import ENTROPY, QUANTIZED
 from sw_anchors.phase_switch import PhaseSwitch
@@ -26,7 +26,6 @@ class HACStage(CodedAnchorStage):
 
     name = "hac"
     opt: HACParams
-    leading: Any = None  # task of a training to a size, with its `steps`
 
     def learning_rates(self, step: int) -> Mapping[str, float]:
         lr = self.opt.lr
@@ -44,8 +43,6 @@ class HACStage(CodedAnchorStage):
         PhaseSwitch(self.at(phases.entropy), ENTROPY).register(scheduler)
         if self.opt.rate_term.start == "statistics":
             scheduler.register_task(self.at(phases.entropy), self.start_from_statistics)
-        if self.leading is not None:
-            scheduler.register_task(self.leading.steps, self.leading, name="lead lambda to the size")
 
     def start_from_statistics(self, model: HACAnchors) -> None:
         """Start the network behind the grid at mean and deviation of the values, see the model's method."""
@@ -64,7 +61,7 @@ class HACStage(CodedAnchorStage):
         if rate is None:
             return {}
         assert rate.own_bits is not None
-        factor: float = model.led.get("factor", 1.0)
+        factor: float = 1.0 if self.leading is None else self.leading.factor
         weight, masks = factor * self.opt.rate_term.weight, factor * self.opt.rate_term.masks
         terms = {
             "rate": (weight, rate.bits),

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 from pydantic import Field
 from sw_gaussians.choices import Choosing, CodecChoice
 from sw_gaussians.method import GaussianMethod
+from sw_gaussians.sized import Sized
 
 from splatwizard_core.api import Scene, SplatModel, SplatOptimizer, Stage
 
@@ -24,7 +25,7 @@ class TrainedScene(Stage):
         return SplatOptimizer(model, [])
 
 
-class FormatConfig(Choosing):
+class FormatConfig(Sized, Choosing):
     """Base of the configs: nothing is trained."""
 
     iterations: int = Field(0, ge=0, description="without effect: nothing is trained after the scene of 3dgs")

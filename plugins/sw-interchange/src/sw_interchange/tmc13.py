@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
+from sw_gaussians.sized import Sized, fill
 from sw_gaussians.surfels import refuse_surfels
 
-from splatwizard_core.api import BitstreamError, GaussianModel, Method, OptimizationParams, SplatModel, Stage
+from splatwizard_core.api import BitstreamError, GaussianModel, Method, SplatModel, Stage
 from sw_interchange import gsc_quant, tmc3
 from sw_interchange.gsc_quant import Floats, Integers
 from sw_interchange.methods import TrainedScene
@@ -31,11 +32,11 @@ RED, GREEN, BLUE = 0.2126, 0.7152, 0.0722  # luma of BT.709
 TO_BLUE, TO_RED = 1.8556, 1.5748  # of its chroma
 
 
-class Tmc13Config(OptimizationParams):
+class Tmc13Config(Sized):
     """Everything that can be set for tmc13. Defaults are those of r5."""
 
     ENCODING: ClassVar[tuple[str, ...]] = (
-        "position_bits", "bits", "range", "qp_dc", "qp_sh_luma", "qp_sh_chroma", "qp_shape",
+        "size", "position_bits", "bits", "range", "qp_dc", "qp_sh_luma", "qp_sh_chroma", "qp_shape",
     )  # fmt: skip
 
     iterations: int = Field(0, ge=0, description="without effect: nothing is trained after the scene of 3dgs")
@@ -87,6 +88,9 @@ class Tmc13(Method):
         if not isinstance(model, GaussianModel):
             raise TypeError(f"{self.name} encodes a GaussianModel, not a {type(model).__name__}")
         refuse_surfels(model, "tmc13")
+        if self.config.size:
+            fill(self, model, writer)
+            return
         opt, degree = self.config, model.active_sh_degree
         values = {name: luma_chroma(each) if name.startswith("sh") else each
                   for name, each in gsc_quant.stored_values(model).items()}  # fmt: skip

@@ -8,6 +8,7 @@ from sw_gaussians.choices import Choosing, CodecChoice, Moved, PrunerChoice
 from sw_gaussians.finetune.distillation import DistillLoss
 from sw_gaussians.finetune.fine_tuning import FineTuningRates
 from sw_gaussians.finetune.pruning import CountRule
+from sw_gaussians.sized import Sized
 
 from splatwizard_core.api import Params
 from sw_lightgaussian.importance_vq import VQSettings
@@ -81,7 +82,7 @@ _CODEC_KEYS = {
 _SCORE, _CODEC = SignificanceSettings.model_fields, VQSettings.model_fields
 
 
-class LightGaussianConfig(Choosing):
+class LightGaussianConfig(Sized, Choosing):
     """Everything that can be set for LightGaussian."""
 
     FULL_ITERATIONS: ClassVar[int] = 5_000

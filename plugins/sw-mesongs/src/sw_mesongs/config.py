@@ -4,6 +4,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 from sw_gaussians.choices import Choosing, OwnCodec, PrunerChoice
+from sw_gaussians.sized import Sized
 
 from splatwizard_core.api import Params
 from sw_codecs.models.raht_settings import RahtOptions
@@ -74,11 +75,11 @@ class Rates(Params):
         return {name: rate * factor * self.final**share for name, rate in rates.items()}
 
 
-class MesonGSConfig(Choosing):
+class MesonGSConfig(Sized, Choosing):
     """Everything that can be set for MesonGS."""
 
     FULL_ITERATIONS: ClassVar[int] = 3_000
-    ENCODING: ClassVar[tuple[str, ...]] = ()  # training draws through the codec
+    ENCODING: ClassVar[tuple[str, ...]] = ("size",)  # training draws through the codec
 
     iterations: int = Field(
         3_000, ge=0, description="steps of the fine-tuning (authors' script: 8000); 0: the scene is encoded as it is"

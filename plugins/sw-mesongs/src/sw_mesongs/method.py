@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from sw_gaussians.sized import fill
+
 from splatwizard_core.api import ConfigError, Method, SceneError
 from sw_codecs.models.raht_gaussians import RahtGaussians
 from sw_mesongs.config import MesonGSConfig
@@ -53,6 +55,9 @@ class MesonGS(Method):
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         if not isinstance(model, RahtGaussians) or model.grid is None:
             raise TypeError(f"{self.name} encodes what its stage has settled, not a {type(model).__name__}")
+        if self.config.size:
+            fill(self, model, writer)
+            return
         writer.static["codec"] = CODEC
         self.plugins.gaussian_codecs.load(CODEC)(self.plugins).encode(model, writer)
 

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from sw_gaussians.choices import Choosing, CodecChoice, Moved, PrunerChoice
 from sw_gaussians.finetune.fine_tuning import FineTuningRates
 from sw_gaussians.finetune.pruning import CountRule
-from sw_gaussians.sized import Sized
+from sw_gaussians.sized import FILLING, Sized
 
 
 class Prune(PrunerChoice):
@@ -48,6 +48,7 @@ class Rates(FineTuningRates):
 class Pup3DGSConfig(Sized, Choosing):
     """Everything that can be set for PUP 3D-GS."""
 
+    FILLED_BY: ClassVar[str] = FILLING
     FULL_ITERATIONS: ClassVar[int] = 10_000
     OLDER: ClassVar[Mapping[str, Moved]] = {
         "codec": Moved(("codec.name",)),

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 from pydantic import Field
 from sw_gaussians.choices import Choosing, CodecChoice, Moved, PrunerChoice
 from sw_gaussians.older_keys import within
-from sw_gaussians.sized import Sized
+from sw_gaussians.sized import FILLING, CappedBase
 
 
 class Prune(PrunerChoice):
@@ -20,9 +20,10 @@ class Prune(PrunerChoice):
     interval: int = Field(3_000, ge=1, description="steps between removals")
 
 
-class SpeedySplatConfig(Sized, Choosing):
+class SpeedySplatConfig(CappedBase, Choosing):
     """Everything that can be set for Speedy-Splat."""
 
+    FILLED_BY: ClassVar[str] = FILLING
     OLDER: ClassVar[Mapping[str, Moved]] = {
         "codec": Moved(("codec.name",)),
         "prune.channel_mode": Moved(("prune.settings.channel_mode",), "sum", "speedy-splat"),

@@ -8,12 +8,13 @@ from pydantic import Field
 from sw_gaussians.choices import Choosing, CodecChoice, PrunerChoice
 from sw_gaussians.config import GaussianTraining
 from sw_gaussians.finetune.fine_tuning import FineTuningRates
+from sw_gaussians.sized import Capped, Sized
 
 from splatwizard_core.api import Params
 from sw_trimgs.scale_split import Box
 
 
-class FlatConfig(GaussianTraining):
+class FlatConfig(Capped, GaussianTraining):
     """Everything that can be set for 3DGS with flat Gaussians."""
 
     sh_degree: int = Field(3, ge=0, le=3, description="highest degree of the spherical harmonics")
@@ -77,7 +78,7 @@ class Normals(Params):
     refresh: int = Field(500, ge=1, description="steps between two searches for them, beside that after each change")
 
 
-class TuneConfig(Choosing):
+class TuneConfig(Sized, Choosing):
     """Settings of the fine-tuning, whatever it trains."""
 
     FULL_ITERATIONS: ClassVar[int] = 7_000

@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 from pydantic import Field
 from sw_gaussians.choices import Choosing, CodecChoice
 from sw_gaussians.older_keys import within
+from sw_gaussians.sized import CappedBase
 from sw_gaussians.surface_losses import NormalTerm
 
 from splatwizard_core.api import Params
@@ -79,7 +80,7 @@ class ScratchSurface(Params):
     erosion: int = Field(1, ge=0, description="pixels around those that do not count either")
 
 
-class ScratchConfig(Choosing):
+class ScratchConfig(CappedBase, Choosing):
     """Everything that can be set for TrimGS on surfels that are trained from the start; all else is 2DGS' `base`."""
 
     FULL_ITERATIONS: ClassVar[int] = 30_000

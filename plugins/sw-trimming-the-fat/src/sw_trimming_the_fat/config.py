@@ -8,7 +8,7 @@ from typing import ClassVar, Literal
 from pydantic import Field, model_validator
 from sw_gaussians.choices import Choosing, CodecChoice, Moved, PrunerChoice
 from sw_gaussians.finetune.fine_tuning import FineTuningRates
-from sw_gaussians.sized import Sized
+from sw_gaussians.sized import FILLING, Sized
 
 
 class Prune(PrunerChoice):
@@ -47,6 +47,7 @@ class Prune(PrunerChoice):
 class TrimmingTheFatConfig(Sized, Choosing):
     """Everything that can be set for Trimming the Fat."""
 
+    FILLED_BY: ClassVar[str] = FILLING
     FULL_ITERATIONS: ClassVar[int] = 15_000
     OLDER: ClassVar[Mapping[str, Moved]] = {"codec": Moved(("codec.name",))}
 

@@ -157,6 +157,7 @@ class WispConfig(Choosing):
 
     FULL_ITERATIONS: ClassVar[int] = 18_000
     OLDER: ClassVar[Mapping[str, Moved]] = {"encode.rdoq": Moved((), False)}
+    REFUSES: ClassVar = {"gaussians": "its splats are bounded by --set budget.cap=N"}
 
     iterations: int = Field(18_000, ge=1, le=10**9, description="steps after the scene that it starts from")
     budget: Budget = Field(Budget(), description="how many splats begin")
@@ -170,6 +171,7 @@ class WispConfig(Choosing):
     appearance: Appearance = Field(Appearance(), description="view dependence")
     loss: Loss = Field(Loss(), description="the rest of the loss")
     layers: LayersOfTheFile = Field(LayersOfTheFile(), description="packets of the file")
+    size: str = Field("", description="bytes of the file at most: 5MB; lambda is led to it; empty: as lambda has it")
     codec: Codec = Field(Codec(), description="what writes the file")
 
     @property

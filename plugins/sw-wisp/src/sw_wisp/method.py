@@ -52,7 +52,13 @@ class Wisp(Method):
         raise SceneError(f"{self.name} starts from a trained 3dgs scene, not from points", path=scene.path)
 
     def stages(self) -> Sequence[Stage]:
-        return [WispStage(self.config)]
+        stage = WispStage(self.config)
+        if self.config.size:
+            lead, rate = self.plugins.tasks.load("lead-to-size"), self.config.rate_term
+            first, last = (stage.step_of(step) for step in (rate.start + rate.ramp, self.config.phases.freeze))
+            least = 13_353 if self.config.context.networks == "large" else 6_701  # bytes of the networks
+            lead(self.config.size, self.name, first, last - 1, least=least).lead(stage)
+        return [stage]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         if not isinstance(model, WispModel):

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from typing import Any
 
 import torch
 from sw_gaussians.removal import removal_costs
@@ -70,6 +71,7 @@ class WispStage(Stage):
 
     name = "wisp"
     starts_from = "3dgs"
+    leading: Any = None  # task `lead-to-size` of a training to a size, by whose `factor` bits cost more
 
     def __init__(self, opt: WispConfig) -> None:
         super().__init__(opt)
@@ -95,7 +97,7 @@ class WispStage(Stage):
     def price(self, step: int | None = None) -> float:
         """Loss of one bit at a step of this run; None: once lambda has risen."""
         rate = self.config.rate_term
-        full = rate.lambda_ / self._pixels
+        full = rate.lambda_ / self._pixels * (1.0 if self.leading is None else self.leading.factor)
         if step is None:
             return full
         start, ramp = self.step_of(rate.start), self.step_of(rate.ramp)

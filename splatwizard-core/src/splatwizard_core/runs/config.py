@@ -331,7 +331,8 @@ def resolve(
             else:
                 if key in ("size", "gaussians"):  # options of `sw run`, which only some methods take
                     able = sorted(e.name for e in plugins.methods if not e.foreign and field_at(e.load().Config, key))
-                    raise ConfigError(f"method '{method.name}' takes no {key}, unlike {', '.join(able)}", key=key)
+                    why = getattr(method.Config, "REFUSES", {}).get(key, f"unlike {', '.join(able)}")
+                    raise ConfigError(f"method '{method.name}' takes no {key}: {why}", key=key)
                 known = [k for block in reversed(given) for k in block_keys(block)]
                 raise unknown_key(key, [*known, *config.settings_keys(plugins)], source)
             provenance[key] = source

@@ -54,16 +54,8 @@ def encode(
     before = model.digest()
     synchronize(model.device)
     cores, began = CoreTime(), work_time()
-    writer = ContainerWriter(method.name, method.version, raster=raster)
-    ordered = one_order_of_sums() if deterministic else contextlib.nullcontext()
-    with torch.no_grad(), ordered, method.plugins.recording() as loaded:
-        method.encode(model, writer)
-    if any(origin):
-        writer.world_origin = origin
-    loaded += [method.plugins.registries[kind].entry(name) for kind, name in writer.required]
-    if method.name in method.plugins.methods:
-        loaded.insert(0, method.plugins.methods.entry(method.name))
-    writer.requires = requirements(loaded)
+    with one_order_of_sums() if deterministic else contextlib.nullcontext():
+        writer, loaded = filled_writer(method, model, raster, origin)
     size = writer.write(path)
     synchronize(model.device)
     seconds, contended = work_time() - began, contention("encode", cores)
@@ -78,6 +70,22 @@ def encode(
         made_by=made_by(method.plugins, loaded),
         parts=unique(part_of(entry) for entry in loaded),
     )
+
+
+def filled_writer(
+    method: Method, model: SplatModel, raster: dict[str, Any], origin: Origin = NOWHERE
+) -> tuple[ContainerWriter, list[Entry]]:
+    """Return what `encode` writes, and the entries that were asked for."""
+    writer = ContainerWriter(method.name, method.version, raster=raster)
+    with torch.no_grad(), method.plugins.recording() as loaded:
+        method.encode(model, writer)
+    if any(origin):
+        writer.world_origin = origin
+    loaded += [method.plugins.registries[kind].entry(name) for kind, name in writer.required]
+    if method.name in method.plugins.methods:
+        loaded.insert(0, method.plugins.methods.entry(method.name))
+    writer.requires = requirements(loaded)
+    return writer, loaded
 
 
 def requirements(entries: Iterable[Entry]) -> list[Requirement]:

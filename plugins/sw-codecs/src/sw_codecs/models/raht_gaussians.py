@@ -133,6 +133,13 @@ class RahtGaussians(GaussianModel):
         self.detail.observe(self.plan().forward(self.attributes())[1:])
         self.scale_lattice.observe(self.log_scales)
 
+    def with_rows(self, rows: Tensor) -> RahtGaussians:
+        part = super().with_rows(rows)
+        used, part.code = torch.unique(part.code, return_inverse=True)
+        part.codebook = nn.Parameter(part.codebook.detach()[used], requires_grad=False)
+        part.recalibrate()
+        return part
+
     def plan(self) -> RahtPlan:
         """Return the plan of the transform over the voxels; kept. The model must be settled."""
         if self._plan is None or self._plan[0] is not self.cells:

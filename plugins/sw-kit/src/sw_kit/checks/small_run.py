@@ -36,6 +36,8 @@ HOSTILE = 100
 """Number of damaged files that the decoder is shown, unless they take longer than `ENOUGH_S`."""
 ENOUGH_S = 12
 HOSTILE_S = 600
+ASKED, LEAST_FILLED = 0.9, 0.94
+"""Size that is asked for, over the plain file's; share of it that is enough for so few Gaussians (of many: 0.97)."""
 
 
 def check_small_run(entry: Entry, plugins: PluginManager, settings: Sequence[str] = ()) -> str:
@@ -72,8 +74,25 @@ def check_small_run(entry: Entry, plugins: PluginManager, settings: Sequence[str
                 progressive = small_configuration(entry, plugins, more)
                 data = file_of(entry.load()(plugins, progressive.config), model)
                 prefixes = f"; {check_prefixes(data, lambda reader: entry.load()(plugins, None).decode(reader))}"
+            sized = ""
+            if {"size"} <= set(resolved.config.ENCODING) & set(type(resolved.config).model_fields):
+                wanted = round(ASKED * record.file.bytes)
+                asked = small_configuration(entry, plugins, [*settings, f"size={wanted}"])
+                method = entry.load()(plugins, asked.config)
+                method.scene = session.scene(resolved)
+                sized = f"; {check_size(len(file_of(method, model)), wanted)}"
             hostile = _check_hostile(child)
-    return f"{steps} steps, {record.file.bytes:,} bytes, {psnr:.1f} dB; {resumed}{prefixes}; {hostile}"
+    return f"{steps} steps, {record.file.bytes:,} bytes, {psnr:.1f} dB; {resumed}{prefixes}{sized}; {hostile}"
+
+
+def check_size(found: int, asked: int) -> str:
+    """Hold a file to the size that was asked for: never more, and nearly all of it."""
+    hold(
+        LEAST_FILLED * asked < found <= asked,
+        f"with size={asked:,} its file has {found:,} bytes",
+        f"a file of a size has {LEAST_FILLED:.0%} to 100 % of it: `sw_gaussians.sized.fill` writes one",
+    )
+    return f"a size is filled to {found / asked:.1%}"
 
 
 def small_configuration(
