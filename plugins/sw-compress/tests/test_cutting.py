@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from sw_compress.cutting import FILLED, rows_that_fit
+from sw_compress.cutting import FILLED, rows_that_fit, with_rows
 from sw_compress.rate_ladder import RateLadder
 
 from splatwizard_core.api import ConfigError, GaussianModel, UserInputError, create_method
@@ -97,7 +97,7 @@ def test_a_size_that_is_too_large_writes_the_whole_model_and_is_told(ball, tmp_p
 
 def test_a_copy_has_the_rows_alone(ball):
     model = ball(20)
-    part = model.with_rows(torch.tensor([3, 5]))
+    part = with_rows(model, torch.tensor([3, 5]))
     assert isinstance(part, GaussianModel)
     assert part.num_rows == 2
     assert torch.equal(part.means, model.means[[3, 5]])

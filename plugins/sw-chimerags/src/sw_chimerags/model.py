@@ -76,10 +76,9 @@ class MaskedGaussians(ScoredGaussians):
         self.importance.copy_(scores.clamp_min(torch.finfo(self.importance.dtype).min))
         self._scored = self._digest()
 
-    def with_rows(self, rows: Tensor) -> MaskedGaussians:
-        part = super().with_rows(rows)
-        part.set_importance(part.importance)
-        return part
+    def after_cut(self) -> None:
+        """Let the importance of the rows that are left stay what it is."""
+        self.set_importance(self.importance)
 
     def has_importance(self) -> bool:
         """Whether the importance is that of these very Gaussians: as many, at the same places."""

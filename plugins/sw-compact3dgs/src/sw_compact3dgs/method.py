@@ -78,7 +78,7 @@ class Compact3DGS(Method):
         if not isinstance(model, CompactGaussians):
             raise TypeError(f"compact3dgs encodes its own Gaussians, not a {type(model).__name__}")
         if self.config.size:
-            fill(self, model.in_file(), writer)
+            fill(self, model, writer)
             return
         file.encode(model, writer, self.plugins, self.config.codec.settings)
 

@@ -78,9 +78,9 @@ class CompactGaussians(VolumeMaskedGaussians):
         )  # fmt: skip
         return drawn(masked, self.color, None, camera, rasterizer)
 
-    def in_file(self) -> CompactGaussians:
-        """Return a copy with the Gaussians that the masks leave in the file."""
-        return self.with_rows(torch.nonzero(self.rate.exact(self.mask_logits)).squeeze(1))
+    def rows_in_file(self) -> Tensor:
+        """Return the rows [M] int64 that the masks leave in the file."""
+        return torch.nonzero(self.rate.exact(self.mask_logits)).squeeze(1)
 
     def unit_quats(self) -> Tensor:
         """[N,4] of length 1."""

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from sw_gaussians.byte_sizes import parse_size
 from sw_gaussians.render_options import options_of
-from torch import Tensor
+from torch import Tensor, nn
 
 from splatwizard_core.api import CapabilityError, UserInputError
 from splatwizard_core.tooling import NegotiatedRasterizer, filled_writer
@@ -38,9 +38,22 @@ TRIES = 8
 """Settings and numbers of rows that are tried, each."""
 
 
+@torch.no_grad()
 def with_rows(model: SplatModel, rows: Tensor) -> SplatModel:
-    """Return the model with some rows alone."""
-    return model.with_rows(rows)
+    """Return a copy in eval mode with the rows [M] of its `ROWS` alone, in that order."""
+    part = copy.deepcopy(model)
+    for name in part.ROWS:
+        value = getattr(part, name)
+        kept = value.detach()[rows].contiguous()
+        setattr(part, name, nn.Parameter(kept, requires_grad=False) if isinstance(value, nn.Parameter) else kept)
+    if hasattr(part, "after_cut"):
+        part.after_cut()
+    return part.eval()
+
+
+def in_file(model: SplatModel) -> SplatModel:
+    """Return the rows of a model that its file holds."""
+    return with_rows(model, model.rows_in_file()) if hasattr(model, "rows_in_file") else model
 
 
 @dataclass(frozen=True)
@@ -61,7 +74,7 @@ class SizeFilling:
     """
 
     def __init__(self, method: Method, model: SplatModel, writer: ContainerWriter) -> None:
-        self.method, self.model, self.raster = method, model, dict(writer.raster)
+        self.method, self.model, self.raster = method, in_file(model), dict(writer.raster)
         self.asked = str(method.config.size)
         self.size = parse_size(self.asked) - SLACK
         self.plain = self._with(method.config.model_copy(update={"size": ""}))
@@ -155,7 +168,7 @@ class SizeFilling:
         order, tried = self._rows_by_worth(), dict[int, Tried]()
 
         def written(rows: int) -> int:
-            tried[rows] = self._try(whole.config, self.model.with_rows(order(rows)), rows)
+            tried[rows] = self._try(whole.config, with_rows(self.model, order(rows)), rows)
             self.least = min(self.least, tried[rows].bytes)
             return tried[rows].bytes
 
@@ -202,7 +215,7 @@ def rows_by_worth(method: Method, model: SplatModel, raster: Mapping[str, Any]) 
 
     By opacity where there is no scene, and where no rasterizer tells what a removal changes.
     """
-    model = model.with_rows(torch.arange(model.num_rows, device=model.device))
+    model = with_rows(model, torch.arange(model.num_rows, device=model.device))
     if method.scene is not None:
         rasterizer = NegotiatedRasterizer(method.plugins, device=model.device, options=options_of(raster))
         seen = training_views(model, method.scene)

@@ -27,7 +27,7 @@ from splatwizard_core.api import (
     UserInputError,
 )
 from splatwizard_core.tooling import PlannedTask, filled_writer, load_plugins
-from sw_compress.cutting import rows_by_worth, rows_that_fit
+from sw_compress.cutting import rows_by_worth, rows_that_fit, with_rows
 
 logger = logging.getLogger(__name__)
 
@@ -241,7 +241,7 @@ class LeadToSize:
             self._tell(whole)
             return
         order = rows_by_worth(method, model, self.raster)
-        count = rows_that_fit(model.num_rows, whole, size, lambda rows: written(model.with_rows(order(rows))))
+        count = rows_that_fit(model.num_rows, whole, size, lambda rows: written(with_rows(model, order(rows))))
         if not count:
             raise UserInputError(f"no file of {self.size:,} bytes was found: one row is too much")
         kept = torch.zeros(model.num_rows, dtype=torch.bool, device=model.device)

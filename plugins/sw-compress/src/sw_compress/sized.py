@@ -88,7 +88,7 @@ class Sized:
 
     def fill(self, method: Method, model: SplatModel, writer: ContainerWriter) -> None:
         """Write a model by a method with a `size`; `sw_gaussians.sized.fill` says how."""
-        writer.take(SizeFilling(method, model, writer).found())
+        vars(writer).update(vars(SizeFilling(method, model, writer).found()))
 
     def encode(self, model: GaussianModel, writer: ContainerWriter) -> None:
         model, codec = self.chosen(model, writer.method, writer.raster, None)

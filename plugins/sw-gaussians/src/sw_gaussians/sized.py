@@ -45,8 +45,8 @@ def fill(method: Method, model: SplatModel, writer: ContainerWriter) -> None:
 
     method  whose `encode` writes the model where `size` is empty
 
-    Steps between its rate points that share the training come first; then rows go (`with_rows` of the model) that the
-    training views miss least.
+    Steps between its rate points that share the training come first; then rows of the model go that the training
+    views miss least: of a copy, whose `after_cut()` may bring the rest in step, from those of `rows_in_file()`.
     Where all is smaller than the size, that is written, and told. Raises UserInputError for a size that is too small.
     """
     method.plugins.gaussian_codecs.entry(FILLING).load()(method.plugins).fill(method, model, writer)

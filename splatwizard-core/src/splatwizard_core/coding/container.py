@@ -97,10 +97,6 @@ class ContainerWriter:
         if (kind, name) not in self.required:
             self.required.append((kind, name))
 
-    def take(self, other: ContainerWriter) -> None:
-        """Hold what another writer has collected, in place of what this one holds."""
-        vars(self).update(vars(other))
-
     @property
     def sections(self) -> dict[str, int]:
         """Bytes of each section added so far."""

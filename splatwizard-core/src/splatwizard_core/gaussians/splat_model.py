@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import copy
 import hashlib
 import json
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -17,8 +16,6 @@ from splatwizard_core.scene.camera import Camera
 
 if TYPE_CHECKING:
     from splatwizard_core.rendering.rasterizer import Rasterizer
-
-ModelT = TypeVar("ModelT", bound="SplatModel")
 
 
 def finite_rows(values: Tensor) -> Tensor:
@@ -59,19 +56,6 @@ class SplatModel(nn.Module):
     def device(self) -> torch.device:
         """Device of the parameters."""
         return next(self.parameters()).device
-
-    @torch.no_grad()
-    def with_rows(self: ModelT, rows: Tensor) -> ModelT:
-        """Return a copy in eval mode with the rows [M] of `ROWS` alone, in that order: what else follows, a model adds.
-
-        A file of a size is one of such a copy.
-        """
-        part = copy.deepcopy(self)
-        for name in part.ROWS:
-            value = getattr(part, name)
-            kept = value.detach()[rows].contiguous()
-            setattr(part, name, nn.Parameter(kept, requires_grad=False) if isinstance(value, nn.Parameter) else kept)
-        return part.eval()
 
     def counts(self) -> dict[str, int]:
         """The counts that a record reports: {"num_gaussians": ...}; other models add those of their primitives."""

@@ -133,12 +133,11 @@ class RahtGaussians(GaussianModel):
         self.detail.observe(self.plan().forward(self.attributes())[1:])
         self.scale_lattice.observe(self.log_scales)
 
-    def with_rows(self, rows: Tensor) -> RahtGaussians:
-        part = super().with_rows(rows)
-        used, part.code = torch.unique(part.code, return_inverse=True)
-        part.codebook = nn.Parameter(part.codebook.detach()[used], requires_grad=False)
-        part.recalibrate()
-        return part
+    def after_cut(self) -> None:
+        """Forget codebook entries that no row has, and ranges of rows that are gone."""
+        used, self.code = torch.unique(self.code, return_inverse=True)
+        self.codebook = nn.Parameter(self.codebook.detach()[used], requires_grad=False)
+        self.recalibrate()
 
     def plan(self) -> RahtPlan:
         """Return the plan of the transform over the voxels; kept. The model must be settled."""
