@@ -46,7 +46,7 @@ def test_a_control_with_a_cap_of_its_own_stays(name: str):
 
 def test_a_cap_that_is_given_holds():
     """Files of runs give it: another size of a trained scene does not train it again."""
-    config = completed({"density": "budget", "density.settings.cap": 77, "size": "1MB", "gaussians": 99})
+    config = completed({"density": "budget", "density.settings.cap": 77, "size": "9kB", "gaussians": 99})
     assert config.density.settings["cap"] == 77
 
 
