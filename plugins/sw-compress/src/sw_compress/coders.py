@@ -187,7 +187,7 @@ class _Sections:
 
     def bits(self, name: str, steps: Steps) -> float:
         """Bits of the columns of an attribute."""
-        symbols = self._rounding.symbols(name, steps).to(torch.int32)
+        symbols = self._rounding.symbols(name, steps)
         if name != "rest":
             return entropy_bits(symbols, self._first, self._first_count, self._table_bits)
         total, activity = 0.0, torch.zeros_like(self._first)
@@ -203,19 +203,7 @@ class _Sections:
 
 def columns_bits(symbols: NDArray[np.int32]) -> float:
     """Bits of integer columns [n,c], each by its own counts, which are stored."""
-    total = 0.0
-    for column in symbols.T:
-        if not len(column):
-            continue
-        low, high = int(column.min()), int(column.max())
-        if low == high:
-            continue
-        shift = max((high - low).bit_length() - 12, 0)  # low bits that go raw where values are many
-        counts = np.bincount((column - low) >> shift)
-        counts = counts[counts > 0]
-        total += float((counts * np.log2(len(column) / counts)).sum()) + shift * len(column)
-        total += TABLE_BITS * len(counts)
-    return total
+    return entropy_bits(torch.from_numpy(symbols), torch.zeros(len(symbols), dtype=torch.int32), 1, TABLE_BITS)
 
 
 def octree_bits(codes: NDArray[np.int64], bits: int) -> list[float]:

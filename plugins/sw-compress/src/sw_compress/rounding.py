@@ -7,7 +7,7 @@ one attribute can change alone: a search draws a dozen of such models, and codes
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,8 +22,8 @@ from sw_codecs.models.position_grid import PositionGrid
 from sw_codecs.models.quantized import FAINTEST
 from sw_compress.rows import IMPORTANCE, like, select
 
-ROWS_AT_ONCE = 1 << 16
-"""Rows whose spherical harmonics are doubles at a time: those of all would be the largest thing in memory."""
+ROWS_AT_ONCE = 1 << 14
+"""Rows that are doubles at a time: those of all would be the largest thing in memory."""
 NAMES = {"means": "positions", "sh_dc": "dc", "opacity_logits": "opacity", "log_scales": "scale", "quats": "quat",
          "sh_rest": "rest"}  # fmt: skip
 """Parameter -> attribute that has a level."""
@@ -71,9 +71,7 @@ class Rounding:
     def change(self, whole: GaussianModel, name: str, steps: Steps) -> GaussianModel:
         """Bring one attribute of a model that was rounded to other steps, in place."""
         place: Tensor = next(getattr(whole, parameter) for parameter, each in NAMES.items() if each == name)
-        found = self.parameter(name, steps, place.detach())
-        if found.data_ptr() != place.data_ptr():
-            place.copy_(found)
+        place.copy_(self.parameter(name, steps, place.detach()))  # of itself, but for positions
         return whole
 
     def _of(self, raw: dict[str, Tensor]) -> GaussianModel:
@@ -83,49 +81,59 @@ class Rounding:
     def parameter(self, name: str, steps: Steps, out: Tensor | None = None) -> Tensor:
         """Values of an attribute, rounded, float32 in the shape of its parameter.
 
-        out     where higher SH coefficients may go, by far the most
+        out     where they go
         """
+        raw: Tensor = next(getattr(self.model, parameter) for parameter, each in NAMES.items() if each == name)
         if name == "positions":
-            return on_grid(self.model.means.detach(), replace(self.grid, bits=steps.bits))
-        if name == "rest":
-            found = torch.zeros_like(self.model.sh_rest) if out is None else out
-            matrix = None if not self._has_basis(steps) else self._matrix()
-            width = self.rest.shape[1]
-            for start, symbols in self._rest_symbols(steps, matrix):
-                part = slice(start, start + len(symbols))
-                scale = steps.of["rest"] * self.factors[part]
-                if matrix is None:
-                    values = (symbols.reshape(len(symbols), width, 3) * scale[:, None, None]) @ self._color
-                else:
-                    scale = steps.of["rest"] / sh_basis.UNIT * self.factors[part]
-                    values = ((symbols @ matrix) * scale[:, None]).reshape(len(symbols), width, 3)
-                found[part, :width] = values.float()
-            return found
-        symbols, widths = self.symbols(name, steps), self._widths(name, steps)[:, None]
-        if name == "dc":
-            return ((symbols * widths) @ self._color).float()[:, None, :]
-        if name == "quat":
-            return _complete(symbols * widths).float()
-        values = (symbols * widths).float()
-        return values[:, 0] if name == "opacity" else values
+            return on_grid(raw.detach(), replace(self.grid, bits=steps.bits))
+        found = torch.zeros_like(raw) if out is None else out
+        matrix, width = self._matrix(name, steps), self.rest.shape[1]
+        for rows in self._blocks():
+            symbols, widths = self._symbols(name, steps, rows, matrix), self._widths(name, steps, rows)[:, None]
+            if name == "rest" and matrix is None:
+                values = (symbols.reshape(len(symbols), width, 3) * widths[:, :, None]) @ self._color
+                found[rows, :width] = values.float()
+            elif matrix is not None:
+                widths = (steps.of["rest"] / sh_basis.UNIT * self.factors[rows])[:, None]
+                found[rows, :width] = ((symbols @ matrix) * widths).reshape(len(symbols), width, 3).float()
+            elif name == "dc":
+                found[rows] = ((symbols * widths) @ self._color).float()[:, None, :]
+            elif name == "quat":
+                found[rows] = _complete(symbols * widths).float()
+            else:
+                found[rows] = (symbols * widths).float().reshape(found[rows].shape)
+        return found
 
     @torch.no_grad()
     def symbols(self, name: str, steps: Steps) -> Tensor:
-        """Integers [N,C] that the file holds, float64."""
-        if name == "rest":
-            matrix = self._matrix() if self._has_basis(steps) else None
-            return torch.cat([part for _, part in self._rest_symbols(steps, matrix)])
-        widths = self._widths(name, steps)[:, None]
-        if name == "dc":
-            return (self.model.sh_dc.detach()[:, 0].double() @ self._color.T / widths).round_()
-        if name == "opacity":
-            logits = self.model.opacity_logits.detach().double().clamp(-MAX_LOGIT, MAX_LOGIT)
-            return (logits[:, None] / widths).round_()
-        return ((self.scales if name == "scale" else self.xyz) / widths).round_()
+        """Integers [N,C] int32 that the file holds."""
+        matrix = self._matrix(name, steps)
+        return torch.cat([self._symbols(name, steps, rows, matrix).int() for rows in self._blocks()])
 
-    def _widths(self, name: str, steps: Steps) -> Tensor:
-        """Step of each row [N]."""
-        found = steps.of[name] * self.factors
+    def _blocks(self) -> list[slice]:
+        """Rows that are doubles at a time."""
+        return [slice(start, start + ROWS_AT_ONCE) for start in range(0, max(self.rows, 1), ROWS_AT_ONCE)]
+
+    def _symbols(self, name: str, steps: Steps, rows: slice, matrix: Tensor | None) -> Tensor:
+        """Integers [n,C] of some rows, float64; of higher SH in the basis, or as luma and chroma."""
+        if name == "rest":
+            part = self.rest[rows].double()
+            if matrix is None:
+                values = (part @ self._color.T).reshape(len(part), -1)
+            else:
+                inverse = torch.linalg.inv(matrix / sh_basis.UNIT)
+                values = (part.reshape(len(part), -1) @ inverse).float().double()  # as the codec keeps them
+        elif name == "dc":
+            values = self.model.sh_dc.detach()[rows, 0].double() @ self._color.T
+        elif name == "opacity":
+            values = self.model.opacity_logits.detach()[rows, None].double().clamp(-MAX_LOGIT, MAX_LOGIT)
+        else:
+            values = (self.scales if name == "scale" else self.xyz)[rows]
+        return (values / self._widths(name, steps, rows)[:, None]).round_()
+
+    def _widths(self, name: str, steps: Steps, rows: slice) -> Tensor:
+        """Step of each row [n]."""
+        found = steps.of[name] * self.factors[rows]
         return found.clamp_max(max(steps.of[name], LARGEST_QUAT_STEP)) if name == "quat" else found
 
     def _classes_of(self, power: float) -> np.ndarray | None:
@@ -140,27 +148,20 @@ class Rounding:
         return precision.classes_of(weights, power)
 
     def _basis(self) -> sh_basis.Basis:
-        some = slice(None, None, sh_basis.stride(self.rows))
-        scaled = self.rest.reshape(self.rows, -1)[some].double() / self.factors[some, None]
-        return sh_basis.of_covariance((scaled.T @ scaled / max(len(scaled), 1)).cpu().numpy())
+        stride, count = sh_basis.stride(self.rows), 0
+        covariance = self.factors.new_zeros(3 * self.rest.shape[1], 3 * self.rest.shape[1])
+        for start in range(0, self.rows, ROWS_AT_ONCE * stride):
+            some = slice(start, start + ROWS_AT_ONCE * stride, stride)
+            scaled = self.rest[some].flatten(1).double() / self.factors[some, None]
+            covariance += scaled.T @ scaled
+            count += len(scaled)
+        return sh_basis.of_covariance((covariance / max(count, 1)).cpu().numpy())
 
-    def _has_basis(self, steps: Steps) -> bool:
-        return self.basis is not None and self.basis.pays(self.rows, steps.of["rest"])
-
-    def _matrix(self) -> Tensor:
-        assert self.basis is not None  # the caller has looked
+    def _matrix(self, name: str, steps: Steps) -> Tensor | None:
+        """The basis of higher SH coefficients as it is stored, where it pays."""
+        if name != "rest" or self.basis is None or not self.basis.pays(self.rows, steps.of["rest"]):
+            return None
         return torch.from_numpy(self.basis.matrix.astype(np.float64)).to(self.factors.device)
-
-    def _rest_symbols(self, steps: Steps, matrix: Tensor | None) -> Iterator[tuple[int, Tensor]]:
-        """First row and integers [n,3R] of some rows at a time, in the basis or as luma and chroma."""
-        inverse = None if matrix is None else torch.linalg.inv(matrix / sh_basis.UNIT)
-        for start in range(0, self.rows, ROWS_AT_ONCE):
-            part = self.rest[start : start + ROWS_AT_ONCE].double()
-            if inverse is None:
-                values = (part @ self._color.T).reshape(len(part), -1)
-            else:
-                values = (part.reshape(len(part), -1) @ inverse).float().double()  # as the codec keeps them
-            yield start, (values / (steps.of["rest"] * self.factors[start : start + len(part)])[:, None]).round_()
 
 
 def on_grid(points: Tensor, grid: PositionGrid) -> Tensor:

@@ -1,0 +1,70 @@
+"""Bytes that are alive at once while a scene is compressed, for each Gaussian: counted, as resident memory never is."""
+
+import weakref
+
+import pytest
+import torch
+from sw_compress import rounding
+from sw_compress.rounding import NAMES, Rounding, Steps
+from sw_compress.rows import IMPORTANCE
+from sw_gaussians import merging, simplifying
+from sw_gaussians.simplifying import merged_by
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+from splatwizard_core.api import GaussianModel
+
+COUNT = 6_000
+MODEL = 236
+"""Bytes of a Gaussian of SH degree 3."""
+
+
+class Alive(TorchDispatchMode):
+    """Counts the bytes of the tensors that operations make until these go."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._known: dict[int, int] = {}
+        self.most = 0
+
+    def __torch_dispatch__(self, operation, types, args=(), kwargs=None):
+        found = operation(*args, **(kwargs or {}))
+        for each in tree_leaves(found):
+            if isinstance(each, torch.Tensor) and each.untyped_storage().data_ptr() not in self._known:
+                place = each.untyped_storage().data_ptr()
+                self._known[place] = each.untyped_storage().nbytes()
+                weakref.finalize(each, self._known.pop, place, None)
+        self.most = max(self.most, sum(self._known.values()))
+        return found
+
+    @property
+    def per_gaussian(self) -> float:
+        """Beside the source, which was there before."""
+        return self.most / COUNT
+
+
+@pytest.fixture
+def source(ball, monkeypatch) -> GaussianModel:
+    for module in (rounding, merging):  # blocks as small against the whole as those of a million are
+        monkeypatch.setattr(module, "ROWS_AT_ONCE", 128)
+    monkeypatch.setattr(simplifying, "PAIRS_AT_ONCE", 128)
+    model = ball(COUNT, degree=3)
+    setattr(model, IMPORTANCE, torch.rand(COUNT, generator=torch.Generator().manual_seed(0)))
+    return model
+
+
+def test_one_rounded_model_is_all_that_sensitivities_need(source):
+    fine, coarse = (Steps(dict.fromkeys(NAMES.values(), step), 15) for step in (0.01, 0.1))
+    with Alive() as alive:
+        known = Rounding(source, 0.4, True)
+        whole = known.model_at(fine)
+        for name in NAMES.values():
+            known.change(whole, name, coarse)
+    assert MODEL < alive.per_gaussian < MODEL + 150
+
+
+def test_merging_needs_what_is_left_about_twice(source):
+    rows = torch.arange(0, COUNT * 9 // 10)
+    with Alive() as alive:
+        merged_by(source, rows, COUNT // 2, getattr(source, IMPORTANCE)[rows])
+    assert MODEL < alive.per_gaussian < 3 * MODEL
