@@ -14,7 +14,7 @@ from torch.utils._pytree import tree_leaves
 
 from splatwizard_core.api import GaussianModel
 
-COUNT = 6_000
+COUNT = 3_000
 MODEL = 236
 """Bytes of a Gaussian of SH degree 3."""
 
