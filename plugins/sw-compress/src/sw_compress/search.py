@@ -58,6 +58,7 @@ class Search:
     def part(self, count: int) -> tuple[GaussianModel, list[Curve]]:
         """The model with as many Gaussians as `count`, or as few as may stay, and its curves."""
         if count not in self._known:
+            self.coder.forget()  # the part before, which is nearly as large as this one
             part = self.reduction.part(count)
             found = part, self.errors.curves(self.coder, part)
             if self.model.num_rows > KEPT:

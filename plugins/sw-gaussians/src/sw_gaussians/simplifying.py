@@ -84,8 +84,9 @@ def _reduced(splats: Splats, count: int, significance: Tensor | None, widen: boo
             near *= 4
         pool.merge(pairs, widen)
         wave += 1
-    left = pool.order
-    return pool.splats.rows(left), None if pool.weights is None else pool.weights[left]
+    left, splats, weights = pool.order, pool.splats, pool.weights
+    del pool  # its table goes before what is left is copied
+    return splats.rows(left), None if weights is None else weights[left]
 
 
 @dataclass

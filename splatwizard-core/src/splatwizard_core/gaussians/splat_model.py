@@ -106,7 +106,7 @@ class SplatModel(nn.Module):
         for name, tensor in sorted(self.state_dict().items()):
             sha.update(f"{name}{tuple(tensor.shape)}{tensor.dtype}".encode())
             if tensor.numel():  # an empty tensor cannot be seen as bytes
-                sha.update(tensor.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().tobytes())
+                sha.update(tensor.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy())
         return sha.hexdigest()
 
     def parameter_hash(self) -> str:
