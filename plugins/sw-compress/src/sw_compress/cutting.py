@@ -28,6 +28,8 @@ log = logging.getLogger(__name__)
 
 FILLED, GOAL = 0.99, 0.996
 """Share of the size that is good enough, and that is aimed at."""
+LEAST_FILLED = 0.97
+"""Share of the size below which a file is told to be too small."""
 SLACK = 64
 """Bytes by which a header may grow when the file is closed: names of what was tried."""
 LOWEST = -3
@@ -90,11 +92,7 @@ class SizeFilling:
             return low.writer
         found = None if high is None else self._by_rows(high)
         if low is not None and not self._is_enough(found):
-            log.warning(
-                "--size %s: the largest file of this training has %s bytes and is written whole; a higher --rate, or "
-                "more Gaussians, make larger ones", self.asked, f"{low.bytes:,}",
-            )  # fmt: skip
-            return low.writer
+            return self._told(low)
         place = 0.0
         while not self._is_enough(found) and place > LOWEST and self.ladder.at(place - 1) is not None:
             place -= 1
@@ -107,6 +105,14 @@ class SizeFilling:
                 f"--size {self.asked}: no file of this training is as small, the smallest that was found has "
                 f"{self.least:,} bytes: ask for more, or take a lower --rate"
             )
+        return self._told(found if low is None else max(found, low, key=lambda each: each.bytes))
+
+    def _told(self, found: Tried) -> ContainerWriter:
+        if found.bytes < LEAST_FILLED * self.size:
+            log.warning(
+                "--size %s: the largest file that was found has %s bytes: a higher --rate, or more Gaussians, make "
+                "larger ones", self.asked, f"{found.bytes:,}",
+            )  # fmt: skip
         return found.writer
 
     def _is_enough(self, found: Tried | None) -> bool:
