@@ -128,7 +128,7 @@ def test_the_base_imports_nothing_of_ours():
 CLOSURES = {
     "sw_hac_plus.method": (60, 6_000),
     "sw_cat_3dgs.method": (60, 6_000),
-    "sw_wisp.method": (60, 7_520),
+    "sw_wisp.method": (60, 7_490),
 }
 """Method -> the most modules and lines of its closure, where not (45, 4,500)."""
 CLOSURE = (45, 4_500)
