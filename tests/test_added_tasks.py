@@ -22,7 +22,7 @@ NEEDED = {
     "settle-learning-rates": {"rates": {"means": 1e-3}, "first": 10, "last": 20},
 }
 """Settings without a default."""
-OTHER_MODELS = {"mask-prune": "VolumeMaskedGaussians", "lead-to-size": "CodedAnchors"}
+OTHER_MODELS = {"mask-prune": "VolumeMaskedGaussians"}
 """Tasks for models of one family."""
 TASKS = [entry.name for entry in load_plugins().tasks if is_ours(entry.distribution)]
 

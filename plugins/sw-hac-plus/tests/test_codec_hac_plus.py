@@ -2,6 +2,7 @@
 
 import json
 import struct
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -279,7 +280,8 @@ def test_a_file_of_a_size_decodes(kind):
     """Features keep their step where a network has learnt to read them in it."""
     model = make(n=2000, channel__kind=kind)
     size = int(0.95 * len(encoded(model, channel__kind=kind)))
-    LeadToSize(str(size), "hac-plus", 10, 20)(model, method(channel__kind=kind).config, 20, TaskLog())
+    scene, config = SimpleNamespace(origin=(0, 0, 0)), method(channel__kind=kind).config
+    LeadToSize(str(size), "hac-plus", 10, 20)(model, config, None, scene, None, 20, TaskLog())
     data = encoded(model, channel__kind=kind)
     assert 0.96 * size - 1_000 < len(data) <= size
     steps = ContainerReader(data).static["base_steps"]

@@ -192,7 +192,7 @@ def test_estimates_are_the_size_of_the_file():
     assert spent[10:].sum() == pytest.approx(8 * sections["packet.02"], rel=0.005)
 
     units = torch.empty(10_000, NUMBERS, dtype=torch.float64)
-    units[rows] = torch.from_numpy(state.units(np.arange(20_000), slice(None)) / UNIT)
+    units[rows] = torch.from_numpy(state.units(np.arange(10_000), slice(None)) / UNIT)
     index = torch.empty_like(units)
     index[rows] = torch.from_numpy(state.index).double()
     with torch.no_grad():

@@ -286,7 +286,7 @@ def test_rate_aliases():
         ("grad_threshold=1", "did you mean 'densify.grad_threshold'"),
         ("iteration=1", "did you mean 'iterations'"),
         ("resolutoin=1", "did you mean 'resolution'"),
-        ("size=5MB", "takes no size, unlike "),
+        ("size=5MB", "takes no size: unlike "),
         ("seeed=1", "did you mean 'seed'"),
         ("qqq=1", r"unknown key 'qqq' in --set: the keys are .*densify"),
         ("densify.grad_threshold=-1", r"bad value '-1' for 'densify.grad_threshold' in --set: must be greater than 0"),
