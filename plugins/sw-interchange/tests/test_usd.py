@@ -234,6 +234,16 @@ def test_a_bad_file_is_refused(name):
 
 
 @with_usd_core
+@pytest.mark.slow
+def test_usd_core_is_ended_where_it_would_wait_for_ever():
+    """So many prims take more memory than there is, and a thread of it that finds none leaves the others waiting."""
+    data, start = b"#usda 1.0\n" + b"".join(b'def "a%d" {}\n' % i for i in range(300_000)), time.monotonic()
+    with pytest.raises(BitstreamError, match="breaks off on it"):
+        decode(data)
+    assert time.monotonic() - start < SECONDS
+
+
+@with_usd_core
 @pytest.mark.parametrize("suffix", [".usda", ".usdc", ".usdz"])
 def test_what_has_only_the_suffix_is_called_damaged(suffix, tmp_path):
     (tmp_path / f"x{suffix}").write_bytes(bytes(300))

@@ -27,8 +27,8 @@ from sw_interchange.source import Source
 FRAMES = {"Y": "RUB", "Z": "RFU"}
 """Axes of a stage by its upAxis."""
 PROGRAM = Path(__file__).with_name("usd_process.py")
-MEGABYTES, SECONDS = (192, 24), (2, 0.2)
-"""Memory and processor time of usd-core for a file: of the smallest, and of each megabyte more."""
+MEGABYTES, SECONDS = (192, 24), (0.5, 0.1)
+"""Memory and processor time of usd-core, once loaded, for a file: of the smallest, and of each megabyte more."""
 MAX_LINE = 1 << 20
 
 
@@ -87,7 +87,9 @@ def _by_usd_core(source: Source) -> tuple[dict[str, Any], memoryview]:
         found = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment, check=False)
     line, _, _ = found.stdout[:MAX_LINE].partition(b"\n")
     if found.returncode or not line:
-        raise BitstreamError(f"{source.name}: usd-core breaks off on it: it is damaged, or takes too much memory")
+        raise BitstreamError(
+            f"{source.name}: usd-core breaks off on it: it is damaged, or takes too much"
+        )
     told: dict[str, Any] = json.loads(line)
     if "refused" in told:
         raise BitstreamError(f"{source.name}: {told['refused']}")
