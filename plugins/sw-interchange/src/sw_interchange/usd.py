@@ -87,9 +87,7 @@ def _by_usd_core(source: Source) -> tuple[dict[str, Any], memoryview]:
         found = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment, check=False)
     line, _, _ = found.stdout[:MAX_LINE].partition(b"\n")
     if found.returncode or not line:
-        raise BitstreamError(
-            f"{source.name}: usd-core breaks off on it: it is damaged, or takes too much"
-        )
+        raise BitstreamError(f"{source.name}: usd-core breaks off on it: it is damaged, or takes too much")
     told: dict[str, Any] = json.loads(line)
     if "refused" in told:
         raise BitstreamError(f"{source.name}: {told['refused']}")
