@@ -298,9 +298,9 @@ def test_both_halves_of_a_page_of_two_are_drawn_and_move_together(browser, scene
     grey = GaussianModel(model.means, torch.ones_like(model.sh_dc), torch.zeros_like(model.sh_rest),
                          model.opacity_logits, model.log_scales, model.quats).requires_grad_(False)  # fmt: skip
     pages, around = [tmp_path / name for name in ("a.html", "b.html", "both.html")], surroundings_of(scene)
-    titled = [(model, About("a")), (grey, About("b"))]
-    for (each, about), page in zip(titled, pages, strict=False):
-        write_page(each, page, about, around)
+    titled = [(model, About("a")), (grey, About("b" * 99))]  # whatever the names, of pictures of one size
+    for (each, _), page in zip(titled, pages, strict=False):
+        write_page(each, page, About("a"), around)
     write_pair(titled, pages[2], around)
 
     def shown(page: Path, width: int, camera: int | None = None, height: int = 700) -> np.ndarray:
@@ -335,6 +335,9 @@ def test_both_halves_of_a_page_of_two_are_drawn_and_move_together(browser, scene
     over = np.asarray(Image.open(tmp_path / "over.png").convert("RGB"), np.float64)[100:600] / 255
     assert psnr(over[:, :318], wide[0][:, :318]) > 40
     assert psnr(over[:, 322:], wide[1][:, 322:]) > 40
+    shown(pages[2], 390, height=844)
+    height_of = "frame => frame.contentDocument.getElementById('canvas').offsetHeight"
+    assert len(set(browser.ask(f"[...document.querySelectorAll('iframe')].map({height_of})"))) == 1
 
 
 def test_an_eye_that_sees_nothing_is_shown_the_background(browser, scene, model, tmp_path):

@@ -32,8 +32,11 @@ function begin(gaussians, { whole, look, eye: seenFrom }) {
   const eye = new Eye(facts, () => { wanted = true; again(); watch(); compare(); if (!hearing) parent.postMessage(eye.place, '*'); });
   const isElsewhere = () => Boolean(look) && eye.eye.some((x, k) => x !== seenFrom[k]);
   hearing = parent === window;
+  document.documentElement.classList.toggle('paired', !hearing);
   if (!hearing) addEventListener('message', ({ data, source }) => {  // beside another model: both look from one place
-    if (source !== parent || !data.axes) return;
+    if (source !== parent) return;
+    if (data.over !== undefined) document.documentElement.dataset.half = data.over;
+    if (!data.axes) return;
     hearing = true;
     eye.take(data);
     hearing = false;
