@@ -68,6 +68,7 @@ ROWS = [
     Row("export {grey.swz} {new} --format pyl", "no exporter is called 'pyl'; did you mean 'ply'?"),
     Row("export {grey.swz} {new}.xyz", "no installed exporter writes '.xyz' files"),
     Row("export {grey.swz} {new}.swz", "`sw compress` writes .swz"),
+    Row("export {grey.swz} {grey.swz}", "is the file that is read: give OUT another name"),
     Row("decode {grey.swz} --out {new}.xyz", "no installed exporter writes '.xyz' files"),
     Row("list-plugins", "SW_PLUGINS names 'nix', which is not installed", env={"SW_PLUGINS": "nix"}),
     Row("run --scene demo:tiny", "no method is named, and the default one is not there", env={"SW_PLUGINS": ""}),

@@ -41,6 +41,8 @@ def export(file: Path, out: Path, exporter: str | None, world: bool, as_json: bo
     """Decode FILE (.swz, .ply or another format) and write it to OUT in the format of its suffix, such as .ply."""
     from splatwizard_core.tooling import bytes_with_named, export_model, load_plugins, open_session, opener
 
+    if out.exists() and out.samefile(file):
+        raise UserInputError(f"{out} is the file that is read: give OUT another name")
     plugins = load_plugins()
     session = open_session(chosen.resolve_without_method(), plugins)
     model = opener(file, session)().model
