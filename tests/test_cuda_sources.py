@@ -24,7 +24,7 @@ def test_there_are_cuda_sources_to_compile():
 
 @pytest.fixture(scope="module")
 def checked() -> list[str]:
-    """What checks a source's device code without making any: the language, and no header but the declared ones."""
+    """Options that check a source's device code and make none: the language, and only declared headers."""
     told = subprocess.run([str(NVCC), "--help"], capture_output=True, text=True, check=True).stdout
     return ["-fdevice-syntax-only"] if "-fdevice-syntax-only" in told else ["-Xcicc", "-O0"]
 

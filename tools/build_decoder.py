@@ -51,7 +51,7 @@ KERNELS_OF_ANCHORS = (
     "bits.cpp", "streams.cpp", "lattice.cpp", "lookups.cpp", "mixtures.cpp", "mixture_rows.cpp", "planes.cpp",
 )  # fmt: skip
 MODULES = ("decoder.wasm", "codebooks.wasm", "anchors.wasm")
-"""What is built: explicit Gaussians and wisp; those that share colours or shapes; anchor methods."""
+"""Modules that are built: explicit Gaussians and wisp; those that share colours or shapes; anchor methods."""
 
 
 def sources(module: str) -> list[Path]:

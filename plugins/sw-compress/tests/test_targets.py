@@ -2,9 +2,8 @@
 
 import pytest
 from sw_compress.targets import Target, parse_quality
-from sw_gaussians.byte_sizes import parse_size
 
-from splatwizard_core.api import UserInputError
+from splatwizard_core.api import UserInputError, parse_size
 
 
 @pytest.mark.parametrize(

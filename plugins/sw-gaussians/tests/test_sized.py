@@ -4,11 +4,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import pytest
-from sw_gaussians.byte_sizes import parse_size
 from sw_gaussians.choices import CodecChoice
 from sw_gaussians.sized import BYTES, FILLING
 
-from splatwizard_core.api import ConfigError, apply_overrides
+from splatwizard_core.api import ConfigError, apply_overrides, parse_size
 from splatwizard_core.tooling import load_plugins
 from sw_3dgs.config import ThreeDGSConfig
 

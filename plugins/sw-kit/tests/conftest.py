@@ -1,4 +1,4 @@
-"""What tests of the checks share: entries of things made up on the spot, and an installed package."""
+"""Fixtures of the tests of checks: entries of things made up on the spot, and an installed package."""
 
 from __future__ import annotations
 

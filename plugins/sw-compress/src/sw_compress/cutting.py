@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import torch
-from sw_gaussians.byte_sizes import parse_size
 from sw_gaussians.render_options import options_of
+from sw_gaussians.sized import LEAST_FILLED
 from torch import Tensor, nn
 
-from splatwizard_core.api import CapabilityError, UserInputError
+from splatwizard_core.api import CapabilityError, UserInputError, parse_size
 from splatwizard_core.tooling import NegotiatedRasterizer, filled_writer
 from sw_compress.pruning import Pruning
 from sw_compress.rate_ladder import RateLadder
@@ -28,8 +28,6 @@ log = logging.getLogger(__name__)
 
 FILLED, GOAL = 0.99, 0.996
 """Share of the size that is good enough, and that is aimed at."""
-LEAST_FILLED = 0.97
-"""Share of the size below which a file is told to be too small."""
 SLACK = 64
 """Bytes by which a header may grow when the file is closed: names of what was tried."""
 LOWEST = -3

@@ -14,7 +14,7 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 from sw_anchors.coded_anchors import CodedAnchors
 from sw_anchors.noisy_values import Noise
-from sw_gaussians.byte_sizes import parse_size
+from sw_gaussians.sized import LEAST_FILLED
 
 from splatwizard_core.api import (
     Method,
@@ -25,6 +25,7 @@ from splatwizard_core.api import (
     SplatOptimizer,
     TaskLog,
     UserInputError,
+    parse_size,
 )
 from splatwizard_core.tooling import PlannedTask, filled_writer, load_plugins
 from sw_compress.cutting import rows_by_worth, rows_that_fit, with_rows
@@ -47,8 +48,6 @@ SAMPLE = 20_000
 """Anchors that the bytes are estimated from."""
 FILLED = 0.985
 """Share of the size that the last choice aims at, and which is good enough where steps are as trained."""
-LEAST_FILLED = 0.97
-"""Share of the size below which a file is told to be too small."""
 LEAST, MOST_STEP = 0.5, 8.0
 """Bounds of the factor on the quantiser steps."""
 SLOPE, SLOPES = -0.5, (-2.0, -0.02)

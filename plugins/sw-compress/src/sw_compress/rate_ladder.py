@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
+
+from sw_gaussians.older_keys import flattened
 
 from splatwizard_core.api import ConfigError, apply_overrides
 
@@ -77,7 +78,7 @@ def between(
     whole   that share for whole numbers; None: the same
     """
     found: dict[str, Any] = {}
-    first, second = _flat(a.model_dump()), _flat(b.model_dump())
+    first, second = flattened(a.model_dump()), flattened(b.model_dump())
     if first.keys() != second.keys():
         return None
     for key, high in second.items():
@@ -102,12 +103,5 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _flat(tables: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for name, value in tables.items():
-        found |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
-    return found
-
-
 def _value(config: OptimizationParams, key: str) -> Any:
-    return _flat(config.model_dump()).get(key)
+    return flattened(config.model_dump()).get(key)

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from pydantic import Field
-from sw_gaussians.byte_sizes import ByteSize, parse_size
+from sw_gaussians.byte_sizes import ByteSize
 from sw_gaussians.choices import CodecChoice
 from sw_gaussians.render_options import options_of
 from sw_gaussians.surfels import refuse_surfels
 
-from splatwizard_core.api import GaussianModel, Params, RasterOptions
+from splatwizard_core.api import GaussianModel, Params, RasterOptions, parse_size
 from splatwizard_core.tooling import NegotiatedRasterizer, say
 from sw_compress.coders import PRECISE_FROM, Quantized
 from sw_compress.cutting import SizeFilling

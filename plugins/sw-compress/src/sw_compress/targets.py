@@ -6,9 +6,7 @@ import math
 import re
 from dataclasses import dataclass
 
-from sw_gaussians.byte_sizes import parse_size
-
-from splatwizard_core.api import UserInputError
+from splatwizard_core.api import UserInputError, parse_size
 
 LEAST_SHARE = 0.99
 """Share of the target that a file fills at least, where the source can."""

@@ -6,8 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator
 
-from splatwizard_core.api import UserInputError
-from splatwizard_core.api import parse_size as parse_size
+from splatwizard_core.api import UserInputError, parse_size
 
 
 def _checked(value: Any) -> str:

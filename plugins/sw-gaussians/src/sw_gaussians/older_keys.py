@@ -98,16 +98,17 @@ def within(values: Mapping[str, Any], prefix: str) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for key, value in values.items():
         if f"{key}." == prefix and isinstance(value, Mapping):
-            found |= _flat(value, prefix)
+            found |= flattened(value, prefix)
         else:
             found[key] = value
     return {_today(key, prefix): value for key, value in found.items()}
 
 
-def _flat(table: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+def flattened(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return the values of a table of tables by dotted key, each with the prefix before it."""
     found: dict[str, Any] = {}
     for name, value in table.items():
-        found |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value}
+        found |= flattened(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value}
     return found
 
 

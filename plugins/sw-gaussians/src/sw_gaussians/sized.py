@@ -25,8 +25,8 @@ BYTES = 12
 """Of one Gaussian in a file of a good mixture of number and precision, SH bands of degree 3 included."""
 MOST_BYTES, HEADER = 236, 4_000
 """Bytes of one Gaussian as float32, SH bands of degree 3 included; of what stands before all of them, at most."""
-FILLED = 0.97
-"""Least share of a size that counts as filled."""
+LEAST_FILLED = 0.97
+"""Share of the size below which a file is too small."""
 
 
 @runtime_checkable
@@ -119,7 +119,7 @@ class Capped(Sized):
     def of_size(self, sources: Mapping[str, str]) -> dict[str, Any]:
         density: DensityChoice = getattr(self, "density")  # noqa: B009
         cap = self.gaussians or (max(parse_size(self.size) // BYTES, 1) if self.size and self.FILLED_BY else 0)
-        if self.gaussians and self.size and FILLED * parse_size(self.size) > MOST_BYTES * self.gaussians + HEADER:
+        if self.gaussians and self.size and LEAST_FILLED * parse_size(self.size) > MOST_BYTES * self.gaussians + HEADER:
             raise ConfigError(
                 f"size={self.size}: {self.gaussians:,} Gaussians have no file as large, {MOST_BYTES} bytes each: "
                 "raise gaussians, or leave it out",

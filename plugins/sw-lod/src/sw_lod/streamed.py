@@ -23,7 +23,7 @@ UNSEEN = 1e-3
 """Of the mean squared picture of a leaf: added to that of each."""
 GENERATOR = "Splatwizard"
 UNIT = re.compile(rf"\d+_\d+/{re.escape(META)}")
-"""What the index calls a unit: level and number."""
+"""Names that the index has for a unit: level and number."""
 DIGITS = 7
 """Of numbers in the index; float32 has no more."""
 

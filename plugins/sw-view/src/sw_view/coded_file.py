@@ -28,7 +28,7 @@ METHODS = (
 )  # fmt: skip
 """Methods whose files the decoder knows (source/decode.cpp), where they are in one of CODECS."""
 CODECS_OF_CODEBOOKS = ("vectree", "gaussians-indexed", "raht", "gsc-quant")
-"""Those that codebooks.wasm knows."""
+"""Codecs that codebooks.wasm knows."""
 CODECS = (
     "gaussians-exact", "gaussians-quantized", "gaussians-tiles", "gaussians-zstd", "gaussians-ply",
     *CODECS_OF_CODEBOOKS,

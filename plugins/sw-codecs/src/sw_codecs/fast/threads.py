@@ -13,8 +13,6 @@ R = TypeVar("R")
 
 MOST = 8
 """Threads at once: each has the arrays of its part in memory."""
-
-
 FEWEST = 1 << 13
 """Rows of a part from which on threads pay."""
 
