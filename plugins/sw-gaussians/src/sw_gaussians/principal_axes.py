@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-AT_ONCE = 1 << 15
-"""Matrices that a solver gets. That of the GPU fails for twice as many: CUSOLVER_STATUS_INTERNAL_ERROR, torch 2.11."""
+SWEEPS = 6
+"""Of rotations over the three pairs of axes; four are usual in float64, since each squares what is left."""
 
 
 def principal_axes(matrices: Tensor) -> tuple[Tensor, Tensor]:
@@ -15,9 +15,33 @@ def principal_axes(matrices: Tensor) -> tuple[Tensor, Tensor]:
 
     matrices    [N,3,3] symmetric
     """
-    parts = [torch.linalg.eigh(part) for part in torch.split(matrices, AT_ONCE)]
-    values, axes = (torch.cat(each) for each in zip(*parts, strict=True))
+    if matrices.device.type != "cpu":  # solvers of a GPU take 530 kB of memory for each matrix
+        return axes_by_turns(matrices)
+    values, axes = torch.linalg.eigh(matrices)
     return values, axes * torch.linalg.det(axes)[:, None, None]  # of three axes all signs may flip: then a rotation
+
+
+def axes_by_turns(matrices: Tensor) -> tuple[Tensor, Tensor]:
+    """As `principal_axes`, all matrices at once: each turn of two axes clears one entry (Jacobi's method)."""
+    diagonal = list(matrices.diagonal(dim1=1, dim2=2).unbind(1))
+    beside = [matrices[:, 1, 2], matrices[:, 0, 2], matrices[:, 0, 1]]  # of the two axes that are not the place
+    axes = list(torch.eye(3, dtype=matrices.dtype, device=matrices.device).expand(len(matrices), 3, 3).unbind(2))
+    for _ in range(SWEEPS):
+        for p, q, r in ((0, 1, 2), (0, 2, 1), (1, 2, 0)):
+            half = (diagonal[q] - diagonal[p]) / 2
+            longest = half.abs() + torch.hypot(half, beside[r])
+            tangent = torch.where(longest > 0, beside[r] / longest, 0).copysign(half * beside[r])
+            cosine = torch.rsqrt(tangent * tangent + 1)
+            sine = tangent * cosine
+            change = tangent * beside[r]
+            diagonal[p], diagonal[q] = diagonal[p] - change, diagonal[q] + change
+            beside[p], beside[q] = sine * beside[q] + cosine * beside[p], cosine * beside[q] - sine * beside[p]
+            beside[r] = torch.zeros_like(change)
+            c, s = cosine[:, None], sine[:, None]
+            axes[p], axes[q] = c * axes[p] - s * axes[q], s * axes[p] + c * axes[q]
+    values, order = torch.stack(diagonal, dim=1).sort(dim=1)
+    first, second = torch.stack(axes, dim=1).gather(1, order[:, :2, None].expand(-1, 2, 3)).unbind(1)
+    return values, torch.stack([first, second, torch.linalg.cross(first, second)], dim=2)
 
 
 def quaternions(rotations: Tensor) -> Tensor:
