@@ -44,9 +44,9 @@ class Alive(TorchDispatchMode):
 
 @pytest.fixture
 def source(ball, monkeypatch) -> GaussianModel:
-    for module in (rounding, merging):  # blocks as small against the whole as those of a million are
-        monkeypatch.setattr(module, "ROWS_AT_ONCE", 128)
-    monkeypatch.setattr(simplifying, "PAIRS_AT_ONCE", 128)
+    monkeypatch.setattr(merging, "ROWS_AT_ONCE", 128)  # blocks as small against the whole as those of a million are
+    monkeypatch.setitem(rounding.ROWS_AT_ONCE, "cpu", 128)
+    monkeypatch.setitem(simplifying.PAIRS_AT_ONCE, "cpu", 128)
     model = ball(COUNT, degree=3)
     model.opacity_logits.clamp_(min=-5)  # what cannot be drawn goes first, as it does when a file is read
     setattr(model, IMPORTANCE, torch.rand(COUNT, generator=torch.Generator().manual_seed(0)))

@@ -6,9 +6,18 @@ import numpy as np
 import pytest
 import torch
 from sw_compress.coders import columns_bits
-from sw_compress.rounding import Rounding, Steps, canonical, entropy_bits, equal_classes, on_grid
+from sw_compress.rounding import (
+    Rounding,
+    Steps,
+    canonical,
+    classes_on_device,
+    entropy_bits,
+    equal_classes,
+    on_grid,
+    sorted_grid,
+)
 
-from sw_codecs.models import band_context, gauge
+from sw_codecs.models import band_context, gauge, precision
 from sw_codecs.models.position_grid import PositionGrid
 
 STEPS = Steps({"opacity": 0.2, "scale": 0.1, "quat": 0.05, "dc": 0.05, "rest": 0.04}, 12)
@@ -32,6 +41,20 @@ def test_positions_lie_in_the_cells_of_the_codec():
     assert np.array_equal(on_grid(torch.from_numpy(points), grid).numpy(), grid.dequantize(grid.quantize(points)))
 
 
+@pytest.mark.parametrize("count", [1, 2, 500, 501, 502, 503])
+def test_grids_by_sorting_are_those_of_the_codec(count: int):
+    points = np.random.default_rng(count).normal(size=(count, 3)).astype(np.float32)
+    points[:9] *= 1000
+    assert sorted_grid(torch.from_numpy(points)) == PositionGrid.fit(points, 1)
+
+
+@pytest.mark.parametrize("count", [0, 1, 500, 501])
+def test_classes_on_a_device_are_those_of_the_codec(count: int):
+    weights = np.random.default_rng(count).lognormal(0, 3, count)
+    weights[: count // 4] = 0
+    assert np.array_equal(classes_on_device(torch.from_numpy(weights), 0.4), precision.classes_of(weights, 0.4))
+
+
 def test_one_attribute_changes_alone(ball):
     rounding = Rounding(ball(300), 0.4, True)
     whole = rounding.model_at(STEPS)
@@ -50,8 +73,9 @@ def test_entropies_are_those_of_each_class(spread: int):
     random = np.random.default_rng(0)
     symbols = random.integers(-spread, spread + 1, (5000, 3)).astype(np.int32)
     classes = random.integers(0, 4, 5000)
+    symbols, classes = torch.from_numpy(symbols), torch.from_numpy(classes)
     known = sum(columns_bits(symbols[classes == k]) for k in range(4))
-    found = entropy_bits(torch.from_numpy(symbols), torch.from_numpy(classes), 4, 3.0)
+    found = entropy_bits(symbols, classes, 4, 3.0)
     assert found == pytest.approx(known, rel=2e-3)
 
 

@@ -30,7 +30,9 @@ ALIKE = torch.stack([torch.zeros(3, 3), torch.eye(3), torch.ones(3, 3), torch.di
 
 
 @pytest.mark.parametrize("solve", [principal_axes, axes_by_turns])
-@pytest.mark.parametrize("matrices", [covariances(200), needles(200), ALIKE, 1e-30 * ALIKE], ids=["usual", "needles", "alike", "small"])
+@pytest.mark.parametrize(
+    "matrices", [covariances(200), needles(200), ALIKE, 1e-30 * ALIKE], ids=["usual", "needles", "alike", "small"]
+)
 def test_axes_are_rotations_that_give_the_matrices(solve, matrices):
     symmetric = (matrices + matrices.mT) / 2
     check(solve(symmetric), symmetric)

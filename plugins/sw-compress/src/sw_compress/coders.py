@@ -6,7 +6,7 @@ A level is the step of an attribute in octaves of the step here; bits of the pos
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,15 +14,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from sw_gaussians.choices import CodecChoice
+from sw_gaussians.morton import interleave
 from torch import Tensor
 
 from splatwizard_core.api import GaussianModel, create_method
 from splatwizard_core.tooling import encode as encode_model
 from sw_codecs.models.band_context import suitable_classes
-from sw_codecs.models.position_grid import PositionGrid
 from sw_codecs.models.settings import QuantizedSettings
-from sw_codecs.positions import morton
-from sw_compress.rounding import Rounding, Steps, entropy_bits, equal_classes
+from sw_compress.rounding import Rounding, Steps, cells_of, entropy_bits, equal_classes, grid_of
 from sw_compress.rows import IMPORTANCE, select
 
 if TYPE_CHECKING:
@@ -145,10 +144,10 @@ class Quantized:
         return found
 
     def _position_sizes(self, model: GaussianModel) -> NDArray[np.float64]:
-        finest = self.settings({**self.finest(model), POSITIONS: float(POSITION_LEVELS[0])})
-        grid = PositionGrid.fit(model.means.detach().cpu().numpy(), finest.position_bits)
-        codes = np.sort(morton.encode(grid.quantize(model.means.detach().cpu().numpy())))
-        bits = octree_bits(codes, finest.position_bits)
+        finest = int(POSITION_BITS - POSITION_LEVELS[0])
+        means = model.means.detach()
+        cells = cells_of(means, replace(grid_of(means), bits=finest)).long()
+        bits = octree_bits(interleave(cells).sort().values, finest)
         return np.array([bits[int(POSITION_BITS - level)] / 8 for level in POSITION_LEVELS])
 
     def encode(self, model: GaussianModel, levels: Levels, path: Path) -> int:
@@ -171,13 +170,11 @@ class _Sections:
 
     def __init__(self, rounding: Rounding, count: int, table_bits: float) -> None:
         self._rounding, self._count, self._table_bits = rounding, count, table_bits
-        device = rounding.factors.device
-        classes = np.zeros(rounding.rows, np.int64) if rounding.classes is None else rounding.classes
-        self._first = torch.from_numpy(classes.astype(np.int64)).to(device)
         if rounding.classes is None:
+            self._first = torch.zeros(rounding.rows, dtype=torch.int64, device=rounding.factors.device)
             self._first_count = 1
         else:
-            self._first, self._first_count = equal_classes(self._first, count), count
+            self._first, self._first_count = equal_classes(rounding.classes.long(), count), count
 
     def precision_bits(self) -> float:
         """Bits of the classes themselves."""
@@ -201,27 +198,24 @@ class _Sections:
         return total
 
 
-def columns_bits(symbols: NDArray[np.int32]) -> float:
-    """Bits of integer columns [n,c], each by its own counts, which are stored."""
-    return entropy_bits(torch.from_numpy(symbols), torch.zeros(len(symbols), dtype=torch.int32), 1, TABLE_BITS)
+def columns_bits(symbols: Tensor) -> float:
+    """Bits of integer columns [n,c] int32, each by its own counts, which are stored."""
+    alone = torch.zeros(len(symbols), dtype=torch.int32, device=symbols.device)
+    return entropy_bits(symbols, alone, 1, TABLE_BITS)
 
 
-def octree_bits(codes: NDArray[np.int64], bits: int) -> list[float]:
+def octree_bits(codes: Tensor, bits: int) -> list[float]:
     """Bits of an octree over sorted Morton codes [n] of `bits` bits an axis, cut at each depth 0 .. `bits`."""
     total, found = 0.0, [0.0]
-    parents = np.ones(1, np.int64)  # children of each node's parent
-    nodes = np.zeros(1, np.int64)
+    parents = torch.ones(1, dtype=torch.int64, device=codes.device)  # children of each node's parent
     for depth in range(1, bits + 1):
-        path = codes >> (3 * (bits - depth))
-        children = path[np.diff(path, prepend=-1) != 0]
-        parent = np.searchsorted(nodes, children >> 3)
-        occupancy = np.bincount(parent, 1 << (children & 7), minlength=len(nodes)).astype(np.int64)
-        for context in range(1, 5):
-            counts = np.bincount(occupancy[np.minimum(parents, 4) == context])
+        children, several = torch.unique_consecutive(codes >> (3 * (bits - depth)), return_counts=True)
+        _, parent, number = torch.unique_consecutive(children >> 3, return_inverse=True, return_counts=True)
+        occupancy = torch.zeros_like(number).scatter_add_(0, parent, 1 << (children & 7))
+        places = 256 * parents.clamp_max(4) + occupancy
+        for counts in torch.bincount(places, minlength=5 * 256).cpu().numpy().reshape(5, 256)[1:]:
             counts = counts[counts > 0]
             total += float((counts * np.log2(counts.sum() / counts)).sum()) + TABLE_BITS * len(counts)
-        number = np.bincount(parent, minlength=len(nodes))
-        nodes, parents = children, number[parent]
-        several = np.diff(np.append(np.flatnonzero(np.diff(path, prepend=-1) != 0), len(path)))
-        found.append(total + (columns_bits(several[:, None].astype(np.int32)) if len(nodes) < len(path) else 0.0))
+        parents = number[parent]
+        found.append(total + (columns_bits(several[:, None].int()) if len(children) < len(codes) else 0.0))
     return found

@@ -114,14 +114,13 @@ class Pruning:
 
     def _among_neighbours(self, order: Tensor) -> Tensor:
         """Count those of the same block of neighbours that come before each of `order` [n] in it."""
-        means = self._model.means.detach()[self._left].double().cpu()
+        means = self._model.means.detach()[self._left].double()
         low, high = means.amin(0), means.amax(0)
         cells = ((means - low) / (high - low).clamp_min(1e-30) * ((1 << 20) - 1)).long()
-        morton = torch.from_numpy(interleave(cells.numpy())).argsort(stable=True)
-        block = torch.empty_like(morton)
-        block[morton] = torch.arange(len(morton)) // NEIGHBOURS
-        blocks = block.to(order.device)[order]
-        by_block = torch.sort(blocks, stable=True)
+        along = interleave(cells).argsort(stable=True)
+        block = torch.empty_like(along)
+        block[along] = torch.arange(len(along), device=along.device) // NEIGHBOURS
+        by_block = torch.sort(block[order], stable=True)
         first = torch.searchsorted(by_block.values, by_block.values)
         place = torch.empty_like(order)
         place[by_block.indices] = torch.arange(len(order), device=order.device) - first

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -18,11 +19,11 @@ from splatwizard_core.api import GaussianModel
 from sw_codecs.models import gauge, precision, sh_basis
 from sw_codecs.models.attributes import LARGEST_QUAT_STEP, MAX_LOGIT
 from sw_codecs.models.luma import COLOR
-from sw_codecs.models.position_grid import PositionGrid
+from sw_codecs.models.position_grid import CORE_SHARE, PositionGrid
 from sw_codecs.models.quantized import FAINTEST
 from sw_compress.rows import IMPORTANCE, like, select
 
-ROWS_AT_ONCE = 1 << 14
+ROWS_AT_ONCE = {"cpu": 1 << 14, "cuda": 1 << 18}
 """Rows that are doubles at a time: those of all would be the largest thing in memory."""
 NAMES = {"means": "positions", "sh_dc": "dc", "opacity_logits": "opacity", "log_scales": "scale", "quats": "quat",
          "sh_rest": "rest"}  # fmt: skip
@@ -51,10 +52,9 @@ class Rounding:
         self.rows = self.model.num_rows
         self.classes = self._classes_of(power)
         device = model.device
-        factors = precision.factors(np.zeros(self.rows, np.int32) if self.classes is None else self.classes)
-        self.factors = torch.from_numpy(factors).to(device)
+        classes = torch.zeros(self.rows, dtype=torch.int32, device=device) if self.classes is None else self.classes
+        self.factors = torch.from_numpy(precision.FACTORS).to(device)[(classes + precision.MOST).long()]
         self._color = torch.from_numpy(COLOR).to(device)
-        self.grid = PositionGrid.fit(self.model.means.detach().cpu().numpy(), 1)
         self.scales, self.xyz = canonical(self.model.log_scales.detach(), self.model.quats.detach())
         self.basis = self._basis() if own_basis and self.rest.numel() else None
 
@@ -62,6 +62,11 @@ class Rounding:
     def rest(self) -> Tensor:
         """Higher SH coefficients that are in use [N,R,3]."""
         return self.model.sh_rest.detach()[:, : (self.model.active_sh_degree + 1) ** 2 - 1]
+
+    @cached_property
+    def grid(self) -> PositionGrid:
+        """Of the positions, with any number of bits."""
+        return grid_of(self.model.means.detach())
 
     def model_at(self, steps: Steps) -> GaussianModel:
         """The model as a file of these steps decodes to."""
@@ -88,7 +93,7 @@ class Rounding:
             return on_grid(raw.detach(), replace(self.grid, bits=steps.bits))
         found = torch.zeros_like(raw) if out is None else out
         matrix, width = self._matrix(name, steps), self.rest.shape[1]
-        for rows in self._blocks():
+        for rows in blocks(self.rows, self.factors.device):
             symbols, widths = self._symbols(name, steps, rows, matrix), self._widths(name, steps, rows)[:, None]
             if name == "rest" and matrix is None:
                 values = (symbols.reshape(len(symbols), width, 3) * widths[:, :, None]) @ self._color
@@ -108,11 +113,9 @@ class Rounding:
     def symbols(self, name: str, steps: Steps) -> Tensor:
         """Integers [N,C] int32 that the file holds."""
         matrix = self._matrix(name, steps)
-        return torch.cat([self._symbols(name, steps, rows, matrix).int() for rows in self._blocks()])
-
-    def _blocks(self) -> list[slice]:
-        """Rows that are doubles at a time."""
-        return [slice(start, start + ROWS_AT_ONCE) for start in range(0, max(self.rows, 1), ROWS_AT_ONCE)]
+        return torch.cat(
+            [self._symbols(name, steps, rows, matrix).int() for rows in blocks(self.rows, self.factors.device)]
+        )
 
     def _symbols(self, name: str, steps: Steps, rows: slice, matrix: Tensor | None) -> Tensor:
         """Integers [n,C] of some rows, float64; of higher SH in the basis, or as luma and chroma."""
@@ -121,8 +124,7 @@ class Rounding:
             if matrix is None:
                 values = (part @ self._color.T).reshape(len(part), -1)
             else:
-                inverse = torch.linalg.inv(matrix / sh_basis.UNIT)
-                values = (part.reshape(len(part), -1) @ inverse).float().double()  # as the codec keeps them
+                values = (part.reshape(len(part), -1) @ self._inverse).float().double()  # as the codec keeps them
         elif name == "dc":
             values = self.model.sh_dc.detach()[rows, 0].double() @ self._color.T
         elif name == "opacity":
@@ -136,22 +138,25 @@ class Rounding:
         found = steps.of[name] * self.factors[rows]
         return found.clamp_max(max(steps.of[name], LARGEST_QUAT_STEP)) if name == "quat" else found
 
-    def _classes_of(self, power: float) -> np.ndarray | None:
+    def _classes_of(self, power: float) -> Tensor | None:
+        """Classes of precision [N] int32; None: all steps are alike."""
         if power <= 0:
             return None
         known = getattr(self.model, IMPORTANCE, None)
+        if known is not None and known.device.type != "cpu":
+            return classes_on_device(known.detach().double(), power)
         if known is not None:
-            weights = known.detach().cpu().double().numpy()
+            weights = known.detach().double().numpy()
         else:
             arrays = (getattr(self.model, name).detach().cpu().numpy() for name in ("opacity_logits", "log_scales"))
             weights = precision.footprints(*arrays)
-        return precision.classes_of(weights, power)
+        return torch.from_numpy(precision.classes_of(weights, power)).to(self.model.device)
 
     def _basis(self) -> sh_basis.Basis:
         stride, count = sh_basis.stride(self.rows), 0
         covariance = self.factors.new_zeros(3 * self.rest.shape[1], 3 * self.rest.shape[1])
-        for start in range(0, self.rows, ROWS_AT_ONCE * stride):
-            some = slice(start, start + ROWS_AT_ONCE * stride, stride)
+        for rows in blocks(-(-self.rows // stride), self.factors.device):
+            some = slice(rows.start * stride, rows.stop * stride, stride)
             scaled = self.rest[some].flatten(1).double() / self.factors[some, None]
             covariance += scaled.T @ scaled
             count += len(scaled)
@@ -161,26 +166,81 @@ class Rounding:
         """The basis of higher SH coefficients as it is stored, where it pays."""
         if name != "rest" or self.basis is None or not self.basis.pays(self.rows, steps.of["rest"]):
             return None
+        return self._stored
+
+    @cached_property
+    def _stored(self) -> Tensor:
+        """The basis."""
+        assert self.basis is not None  # only asked for where it pays
         return torch.from_numpy(self.basis.matrix.astype(np.float64)).to(self.factors.device)
+
+    @cached_property
+    def _inverse(self) -> Tensor:
+        return torch.linalg.inv(self._stored / sh_basis.UNIT)
+
+
+def blocks(count: int, device: torch.device) -> list[slice]:
+    """Rows that are doubles at a time."""
+    step = ROWS_AT_ONCE["cpu" if device.type == "cpu" else "cuda"]
+    return [slice(start, start + step) for start in range(0, max(count, 1), step)]
+
+
+def classes_on_device(weights: Tensor, power: float) -> Tensor:
+    """As `precision.classes_of`, where the weights [N] are; one on the border of two classes may get the other one."""
+    shown = weights[weights > 0].sort().values
+    if len(shown):
+        weights = weights / ((shown[(len(shown) - 1) // 2] + shown[len(shown) // 2]) / 2)
+    found = (2 * power * weights.clamp_min(1e-30).log2()).round()
+    return found.clamp(-precision.MOST, precision.MOST).int()
+
+
+def grid_of(points: Tensor) -> PositionGrid:
+    """The grid that `PositionGrid.fit` gives for points [N,3], found where they are."""
+    if points.device.type == "cpu" or not len(points):
+        return PositionGrid.fit(points.cpu().numpy(), 1)
+    return sorted_grid(points)
+
+
+def sorted_grid(points: Tensor) -> PositionGrid:
+    """The same for some points by sorting, which a GPU does faster than it copies them."""
+    points, last = points.double(), len(points) - 1
+    ordered = points.sort(dim=0).values
+    center = (ordered[last // 2] + ordered[(last + 1) // 2]) / 2
+    away = (points - center).abs().sort(dim=0).values
+    place = int(CORE_SHARE * last)
+    share, low, high = CORE_SHARE * last - place, away[place], away[min(place + 1, last)]
+    core = low + (high - low) * share if share < 0.5 else high - (high - low) * (1 - share)  # as `numpy.quantile`
+    return PositionGrid.around(*(each.cpu().numpy() for each in (center, core, away[-1])), 1)
+
+
+def cells_of(points: Tensor, grid: PositionGrid) -> Tensor:
+    """Cells [N,3] of points [N,3], float64, as `PositionGrid.quantize`."""
+    center, width, top = _numbers(grid, points)
+    u = (points.double() - center) / width
+    away = u.abs()
+    mantissa, exponent = torch.frexp(away.clamp_min(1.0))
+    v = torch.where(away < 1.0, away, exponent + 2 * mantissa - 1.0).copysign(u)
+    return ((v + top) / (2 * top) * 2.0**grid.bits).floor().clamp(0, 2**grid.bits - 1)
 
 
 def on_grid(points: Tensor, grid: PositionGrid) -> Tensor:
     """Centres [N,3] float32 of the cells of points [N,3]."""
-    center, width, top = (torch.tensor(each, dtype=torch.float64, device=points.device)
-                          for each in (grid.center, grid.width, grid.top))  # fmt: skip
+    center, width, top = _numbers(grid, points)
     found = torch.empty_like(points, dtype=torch.float32)
-    for start in range(0, len(points), ROWS_AT_ONCE):
-        u = (points[start : start + ROWS_AT_ONCE].double() - center) / width
-        away = u.abs()
-        mantissa, exponent = torch.frexp(away.clamp_min(1.0))
-        v = torch.where(away < 1.0, away, exponent + 2 * mantissa - 1.0).copysign(u)
-        cells = ((v + top) / (2 * top) * 2.0**grid.bits).floor().clamp(0, 2**grid.bits - 1)
-        v = (cells + 0.5) * (2 * top * 2.0**-grid.bits) - top
+    for rows in blocks(len(points), points.device):
+        v = (cells_of(points[rows], grid) + 0.5) * (2 * top * 2.0**-grid.bits) - top
         away = v.abs()
         octave = away.clamp_min(1.0).floor()
         u = torch.where(away < 1.0, away, torch.ldexp(1.0 + (away - octave), octave - 1)).copysign(v)
-        found[start : start + len(u)] = (u * width + center).float()
+        found[rows] = (u * width + center).float()
     return found
+
+
+def _numbers(grid: PositionGrid, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Centre, width and top [3] of a grid where the points are."""
+    center, width, top = (torch.tensor(each, dtype=torch.float64, device=points.device)
+                          for each in (grid.center, grid.width, grid.top))  # fmt: skip
+    return center, width, top
 
 
 _TURNS = torch.zeros(27, 4, dtype=torch.float64)
@@ -197,8 +257,7 @@ def canonical(log_scales: Tensor, quats: Tensor) -> tuple[Tensor, Tensor]:
     As `sw_codecs.models.gauge.canonical`.
     """
     sorted_scales, xyz = torch.empty_like(log_scales), torch.empty_like(log_scales, dtype=torch.float64)
-    for start in range(0, len(quats), ROWS_AT_ONCE):
-        part = slice(start, start + ROWS_AT_ONCE)
+    for part in blocks(len(quats), quats.device):
         sorted_scales[part], xyz[part] = _canonical(log_scales[part], quats[part])
     return sorted_scales, xyz
 

@@ -31,7 +31,7 @@ ENOUGH = 0.1
 """A wave that merges a smaller share of all Gaussians than this is followed by one that looks further."""
 CELLS = 20
 """Bits of a coordinate along the curve."""
-PAIRS_AT_ONCE = 1 << 14
+PAIRS_AT_ONCE = {"cpu": 1 << 14, "cuda": 1 << 17}
 """Pairs that merge together: in float64 each takes some kB on the way, which stay in the cache of a core."""
 COEFFICIENTS_AT_ONCE = 4
 """Spherical harmonics that are put into another order together: they are most of a Gaussian."""
@@ -128,7 +128,7 @@ class _Pool:
 
     def merge(self, pairs: Tensor, widen: bool) -> None:
         """One Gaussian in place of each pair of rows [P,2]."""
-        for part in pairs.split(PAIRS_AT_ONCE):
+        for part in pairs.split(_at_once(PAIRS_AT_ONCE, pairs)):
             new = merge_groups(self.splats.rows(part), widen=widen).to(self.table.dtype)
             for all_of, values in zip(self.splats, new, strict=True):
                 all_of[part[:, 0]] = values
@@ -142,7 +142,12 @@ class _Pool:
 
 def _blocks(values: Tensor) -> tuple[Tensor, ...]:
     """Rows in blocks whose intermediate columns stay in the cache of a core."""
-    return values.split(ROWS_AT_ONCE["cpu" if values.device.type == "cpu" else "cuda"])
+    return values.split(_at_once(ROWS_AT_ONCE, values))
+
+
+def _at_once(rows: dict[str, int], values: Tensor) -> int:
+    """How many are worked on together where these values are."""
+    return rows["cpu" if values.device.type == "cpu" else "cuda"]
 
 
 def _table(splats: Splats, unit: float, center: Tensor) -> Tensor:
@@ -221,7 +226,7 @@ def _partners(pool: _Pool, near: float, wave: int) -> tuple[Tensor, Tensor]:
     n, device = len(columns.opacities), columns.places.device
     best = torch.full((n,), math.inf, dtype=columns.places.dtype, device=device)
     partner = torch.arange(n, device=device)
-    step = ROWS_AT_ONCE["cpu" if device.type == "cpu" else "cuda"]
+    step = _at_once(ROWS_AT_ONCE, best)
     for start in range(0, n, step):
         for offset in range(1, WINDOW + 1):
             end = min(start + step, n - offset)

@@ -37,9 +37,15 @@ class PositionGrid:
             return cls((0.0,) * 3, (1.0,) * 3, (1,) * 3, bits)
         center = np.median(points, axis=0)
         away = np.abs(points - center)
-        reach = away.max(axis=0)
+        return cls.around(center, np.quantile(away, CORE_SHARE, axis=0), away.max(axis=0), bits)
+
+    @classmethod
+    def around(
+        cls, center: NDArray[np.float64], core: NDArray[np.float64], reach: NDArray[np.float64], bits: int
+    ) -> PositionGrid:
+        """The grid for points whose median, distances that hold CORE_SHARE, and largest distances [3] are known."""
         # A flat axis has no width of its own; a millionth of its reach keeps the octaves few.
-        width = np.maximum(np.quantile(away, CORE_SHARE, axis=0), np.maximum(reach * 1e-6, 1e-9))
+        width = np.maximum(core, np.maximum(reach * 1e-6, 1e-9))
         # floor + 1 rather than ceil: the outermost point stays inside the last cell.
         top = np.floor(_compress(reach / width)).astype(int) + 1
         return cls(_triple(center), _triple(width), (int(top[0]), int(top[1]), int(top[2])), bits)
