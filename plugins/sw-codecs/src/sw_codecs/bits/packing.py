@@ -26,6 +26,8 @@ def unzigzag(values: np.ndarray) -> np.ndarray:
 def bit_length(values: np.ndarray) -> np.ndarray:
     """Bits needed to write each unsigned integer, 0 for 0; int64. Exact over all 64 bits."""
     unsigned = np.asarray(values, np.uint64)
+    if unsigned.max(initial=0) < 1 << 53:
+        return np.frexp(unsigned.astype(np.float64))[1].astype(np.int64)
     high, low = unsigned >> np.uint64(32), unsigned & np.uint64(0xFFFFFFFF)
     # frexp is exact on the 32-bit halves; on the whole it would round 2^53-1 and up.
     return np.where(high > 0, np.frexp(high.astype(np.float64))[1] + 32, np.frexp(low.astype(np.float64))[1]).astype(

@@ -112,5 +112,13 @@ def _unpack_meta(reader: ByteReader) -> np.ndarray:
 
 def table_bits(codes: np.ndarray) -> float:
     """Roughly what a table costs in the file: used for choosing, never for reporting."""
-    steps = np.abs(np.diff(codes, prepend=0))
-    return float(np.where(steps == 0, 1.0, 2.5 + np.log2(1 + steps)).sum())
+    return float(table_steps(codes, [0]).sum())
+
+
+def table_steps(codes: np.ndarray, starts: Sequence[int]) -> np.ndarray:
+    """The same by code, of tables that begin at these places."""
+    steps = np.diff(codes, prepend=0)
+    if len(codes):
+        steps[starts] = codes[starts]
+    steps = np.abs(steps)
+    return np.where(steps == 0, 1.0, 2.5 + np.log2(1 + steps))

@@ -22,7 +22,7 @@ from sw_codecs.bits.packing import (
     write_varint,
     zigzag,
 )
-from sw_codecs.coders.count_tables import code_counts, count_codes, table_bits
+from sw_codecs.coders.count_tables import code_counts, count_codes, table_steps
 
 CONSTANT, BINS, MAGNITUDES, DICTIONARY = 0, 1, 2, 3
 DIFFERENCES = 0x10
@@ -115,9 +115,8 @@ class ColumnPlan:
 
 
 def _candidates(distinct: np.ndarray, counts: np.ndarray) -> list[ColumnPlan]:
+    """Plans that may be the best for several distinct values."""
     low, high = int(distinct[0]), int(distinct[-1])
-    if low == high:
-        return [ColumnPlan(CONSTANT, low)]
     shift = max((high - low).bit_length() - 12, 0)  # at most MAX_TABLE bins
     plans = []
     for parameter in range(shift, min(shift + 5, 62)):
@@ -132,18 +131,32 @@ def _candidates(distinct: np.ndarray, counts: np.ndarray) -> list[ColumnPlan]:
     return plans
 
 
-def _cost(plan: ColumnPlan, distinct: np.ndarray, counts: np.ndarray) -> tuple[ColumnPlan, float]:
-    """The plan with its table size filled in, and its estimated bits."""
-    if plan.kind == CONSTANT:
-        return plan, 0.0
-    classes, _, extra = plan.split(distinct)
-    histogram = np.bincount(classes, counts).astype(np.int64)
+def _costs(plans: list[ColumnPlan], distinct: np.ndarray, counts: np.ndarray) -> list[tuple[ColumnPlan, float]]:
+    """Plans with their table sizes filled in, and their estimated bits; none is a constant.
+
+    Their tables lie one after the other: numbers so few take longer to call than to work on.
+    """
+    parts = [plan.split(distinct) for plan in plans]
+    sizes = [int(classes.max()) + 1 for classes, *_ in parts]
+    ends = np.cumsum(sizes).tolist()
+    places = np.concatenate([classes + (end - size) for (classes, *_), size, end in zip(parts, sizes, ends, strict=True)])
+    histogram = np.bincount(places, np.tile(counts, len(plans))).astype(np.int64)
     codes = count_codes(histogram)
-    stored, used = code_counts(codes), histogram > 0
-    bits = float((histogram[used] * np.log2(stored.sum() / stored[used])).sum()) + table_bits(codes)
-    bits += 8.0 * len(plan.pack()) if plan.kind == DICTIONARY else 0.0
-    bits += float(counts.sum() * plan.parameter if extra is None else (counts * extra).sum())
-    return replace(plan, size=len(histogram)), bits
+    stored = code_counts(codes)
+    used = np.flatnonzero(histogram)
+    used_ends = np.searchsorted(used, ends).tolist()
+    totals = [int(stored[end - size : end].sum()) for size, end in zip(sizes, ends, strict=True)]
+    total = np.repeat(totals, np.diff(used_ends, prepend=0))
+    symbols = histogram[used] * np.log2(total / stored[used])
+    tables = table_steps(codes, [0, *ends[:-1]])
+    found, start = [], 0
+    for plan, (_, _, extra), size, end, used_end in zip(plans, parts, sizes, ends, used_ends, strict=True):
+        bits = float(symbols[start:used_end].sum()) + float(tables[end - size : end].sum())
+        bits += 8.0 * len(plan.pack()) if plan.kind == DICTIONARY else 0.0
+        bits += float(counts.sum() * plan.parameter if extra is None else (counts * extra).sum())
+        found.append((replace(plan, size=size), bits))
+        start = used_end
+    return found
 
 
 def choose_plan(column: np.ndarray) -> ColumnPlan:
@@ -154,11 +167,20 @@ def choose_plan(column: np.ndarray) -> ColumnPlan:
     for first in (None, int(column[0])):
         residuals = replace(best, first=first).residuals(column)
         distinct, counts = _histogram(residuals)
-        for candidate in _candidates(distinct, counts):
-            plan, bits = _cost(replace(candidate, first=first), distinct, counts)
-            if bits < least:
-                best, least = plan, bits
+        if len(distinct) == 1:
+            if least > 0:
+                best, least = ColumnPlan(CONSTANT, int(distinct[0]), first=first), 0.0
+        elif (1 - 1e-9) * _entropy(counts) < least:  # no plan is below it
+            plans = [replace(plan, first=first) for plan in _candidates(distinct, counts)]
+            for plan, bits in _costs(plans, distinct, counts):
+                if bits < least:
+                    best, least = plan, bits
     return best
+
+
+def _entropy(counts: np.ndarray) -> float:
+    """Bits of values that occur so often, by their own shares."""
+    return float((counts * np.log2(counts.sum() / counts)).sum())
 
 
 def _histogram(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
