@@ -139,23 +139,24 @@ def _costs(plans: list[ColumnPlan], distinct: np.ndarray, counts: np.ndarray) ->
     parts = [plan.split(distinct) for plan in plans]
     sizes = [int(classes.max()) + 1 for classes, *_ in parts]
     ends = np.cumsum(sizes).tolist()
-    places = np.concatenate([classes + (end - size) for (classes, *_), size, end in zip(parts, sizes, ends, strict=True)])
+    starts = [0, *ends[:-1]]
+    places = np.concatenate([classes + start for (classes, *_), start in zip(parts, starts, strict=True)])
     histogram = np.bincount(places, np.tile(counts, len(plans))).astype(np.int64)
     codes = count_codes(histogram)
     stored = code_counts(codes)
     used = np.flatnonzero(histogram)
     used_ends = np.searchsorted(used, ends).tolist()
-    totals = [int(stored[end - size : end].sum()) for size, end in zip(sizes, ends, strict=True)]
+    totals = [int(stored[start:end].sum()) for start, end in zip(starts, ends, strict=True)]
     total = np.repeat(totals, np.diff(used_ends, prepend=0))
     symbols = histogram[used] * np.log2(total / stored[used])
-    tables = table_steps(codes, [0, *ends[:-1]])
-    found, start = [], 0
-    for plan, (_, _, extra), size, end, used_end in zip(plans, parts, sizes, ends, used_ends, strict=True):
-        bits = float(symbols[start:used_end].sum()) + float(tables[end - size : end].sum())
+    tables = table_steps(codes, starts)
+    found, first = [], 0
+    for plan, (_, _, extra), start, end, last in zip(plans, parts, starts, ends, used_ends, strict=True):
+        bits = float(symbols[first:last].sum()) + float(tables[start:end].sum())
         bits += 8.0 * len(plan.pack()) if plan.kind == DICTIONARY else 0.0
         bits += float(counts.sum() * plan.parameter if extra is None else (counts * extra).sum())
-        found.append((replace(plan, size=size), bits))
-        start = used_end
+        found.append((replace(plan, size=end - start), bits))
+        first = last
     return found
 
 

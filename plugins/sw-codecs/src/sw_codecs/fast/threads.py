@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
 from splatwizard_native import available_cores
@@ -16,14 +18,32 @@ MOST = 8
 FEWEST = 1 << 13
 """Rows of a part from which on threads pay."""
 
+_this = threading.local()
+
 
 def each_of(work: Callable[[T], R], parts: Sequence[T], *, rows: int = FEWEST) -> list[R]:
     """Results of the work on each part, in their order.
 
     rows    of a part
+
+    Work that asks for threads itself gets none: its caller has them.
     """
-    threads = min(MOST, available_cores(), len(parts)) if rows >= FEWEST else 1
+    return list(each_in_turn(work, parts, rows=rows, ahead=len(parts)))
+
+
+def each_in_turn(
+    work: Callable[[T], R], parts: Sequence[T], *, rows: int = FEWEST, ahead: int = 0
+) -> Iterator[R]:  # fmt: skip
+    """As `each_of`, one after the other: no more of them than there are threads, or `ahead`, wait to be taken."""
+    threads = 1 if rows < FEWEST or getattr(_this, "works", False) else min(MOST, available_cores(), len(parts))
     if threads < 2:
-        return [work(part) for part in parts]
-    with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(work, parts))
+        yield from map(work, parts)
+        return
+    with ThreadPoolExecutor(threads, initializer=setattr, initargs=(_this, "works", True)) as pool:
+        waiting = deque[Future[R]]()
+        for part in parts:
+            if len(waiting) >= max(threads, ahead):
+                yield waiting.popleft().result()
+            waiting.append(pool.submit(work, part))
+        while waiting:
+            yield waiting.popleft().result()

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatwizard_core.api import UserInputError
+from sw_codecs.fast.threads import each_in_turn
 from sw_codecs.models import gauge, sh_basis
 from sw_codecs.models.luma import to_luma, to_rgb
 
@@ -105,21 +106,27 @@ def quantize(given: Ready, steps: Steps, order: NDArray[np.int64]) -> tuple[NDAr
     basis = given.basis if given.basis is not None and given.basis.pays(count, steps.rest) else None
     columns = base_columns(values.log_scales.shape[1]) + int(np.prod(values.rest.shape[1:]))
     symbols: NDArray[Any] = np.empty((count, columns), np.int16)  # the largest thing in memory beside the model
-    for start in range(0, count, ROWS_AT_ONCE):  # doubles of all rows would outweigh the model several times
+
+    def coded(start: int) -> NDArray[Any]:
         rows = order[start : start + ROWS_AT_ONCE]
         factors = given.factors[rows]
         log_scales, quats = gauge.canonical(values.log_scales[rows], values.quats[rows])
         logits = np.clip(values.opacity_logits[rows].astype(np.float64), -MAX_LOGIT, MAX_LOGIT)[:, None]
         rest = values.rest[rows]
-        coded = to_luma(rest) if basis is None else basis.to(rest.reshape(len(rows), -1)).astype(np.float32)
+        higher = to_luma(rest) if basis is None else basis.to(rest.reshape(len(rows), -1)).astype(np.float32)
         found = np.hstack([
             _rounded("dc", steps.dc * factors, to_luma(values.dc[rows])),
             _rounded("opacity", steps.opacity * factors, logits),
             _rounded("scale", steps.scale * factors, log_scales),
             _rounded("quat", _quat_steps(steps, factors), quats[:, 1:]),
-            _rounded("rest", steps.rest * factors, coded.reshape(len(rows), -1)),
+            _rounded("rest", steps.rest * factors, higher.reshape(len(rows), -1)),
         ])  # fmt: skip
-        if symbols.dtype == np.int16 and np.abs(found).max(initial=0) >= 1 << 15:
+        return found.astype(np.int16 if np.abs(found).max(initial=0) < 1 << 15 else np.int32)
+
+    # Doubles of all rows would outweigh the model several times.
+    starts = range(0, count, ROWS_AT_ONCE)
+    for start, found in zip(starts, each_in_turn(coded, starts), strict=True):
+        if found.dtype != symbols.dtype and symbols.dtype == np.int16:
             symbols = symbols.astype(np.int32)
         symbols[start : start + ROWS_AT_ONCE] = found
     return symbols, None if basis is None else basis.matrix

@@ -8,14 +8,19 @@ with its own statistics. It is integer arithmetic on decoded symbols; only the n
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatwizard_core.api import BitstreamError, EntropyModel
+from sw_codecs.entropy.columns import Columns
+from sw_codecs.fast.threads import each_of
 from sw_codecs.models.attributes import MAX_SYMBOL
 from sw_codecs.models.exchangeable import decoded_matrix
+
+R = TypeVar("R")
 
 MAX_CLASSES = 16
 ROWS_PER_CLASS = 2048
@@ -51,7 +56,7 @@ def encode_band(columns: EntropyModel, classes: Sequence[NDArray[np.int32]]) -> 
     columns     the entropy model for integer matrices
     classes     symbols [n,C] of the rows of each
     """
-    parts = [columns.encode(rows, None) if len(rows) else b"" for rows in classes]
+    parts = _each(columns, lambda rows: columns.encode(rows, None) if len(rows) else b"", classes)
     return struct.pack(f"<{len(parts)}I", *map(len, parts)) + b"".join(parts)
 
 
@@ -74,12 +79,25 @@ def decode_band(
     if start + sum(lengths) != len(data):
         raise BitstreamError(f"{len(data):,} bytes, the class lengths say {start + sum(lengths):,}")
     symbols = np.empty((len(classes), width), dtype=np.int32)
-    for k, length in enumerate(lengths):
-        rows = classes == k
-        found = int(rows.sum())
-        if (found == 0) != (length == 0):
-            raise BitstreamError(f"class {k} has {found:,} rows, but {length:,} bytes")
-        if found:
-            symbols[rows] = decode_matrix(columns, data[start : start + length], found, width)
-        start += length
+
+    def decode(part: tuple[int, bytes]) -> None:
+        k, coded = part
+        rows = np.flatnonzero(classes == k)
+        if (len(rows) == 0) != (len(coded) == 0):
+            raise BitstreamError(f"class {k} has {len(rows):,} rows, but {len(coded):,} bytes")
+        if len(rows):
+            symbols[rows] = decode_matrix(columns, coded, len(rows), width)
+
+    ends = np.cumsum((start, *lengths)).tolist()
+    _each(columns, decode, [(k, data[ends[k] : ends[k + 1]]) for k in range(count)], len(classes) // count)
     return symbols
+
+
+def _each(columns: EntropyModel, work: Callable[[Any], R], parts: Sequence[Any], rows: int | None = None) -> list[R]:
+    """Results of the work on each class, by several threads where the entropy model is known to allow it.
+
+    rows    of a class, about; None: the parts tell
+    """
+    if not isinstance(columns, Columns):
+        return [work(part) for part in parts]
+    return each_of(work, parts, rows=max(map(len, parts), default=0) if rows is None else rows)

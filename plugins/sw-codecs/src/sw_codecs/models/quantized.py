@@ -21,6 +21,7 @@ from pydantic import Field, ValidationError
 from sw_gaussians.surfels import SurfelModel, gaussians_of
 
 from splatwizard_core.api import BitstreamError, GaussianModel, Params
+from sw_codecs.fast.threads import each_of
 from sw_codecs.models import precision, sh_basis
 from sw_codecs.models.attributes import SCALES_FROM, Ready, Steps, Values, base_columns, dequantize, quantize, ready
 from sw_codecs.models.band_context import (
@@ -408,7 +409,8 @@ def reconstruct(found: Lattice, swell: float | NDArray[np.float32] = 0.0) -> Gau
     tails = {"means": (3,), "dc": (3,), "rest": ((layout.max_sh_degree + 1) ** 2 - 1, 3), "opacity_logits": (),
              "log_scales": (layout.scales,), "quats": (4,)}  # fmt: skip
     arrays = {name: np.zeros((n, *tail), dtype=np.float32) for name, tail in tails.items()}
-    for start in range(0, n, ROWS_AT_ONCE):
+
+    def fill(start: int) -> None:
         part = slice(start, start + ROWS_AT_ONCE)
         with np.errstate(over="ignore", invalid="ignore"):  # a hostile header may overflow; the caller looks
             factors = None if found.classes is None else precision.factors(found.classes[part])
@@ -417,6 +419,8 @@ def reconstruct(found: Lattice, swell: float | NDArray[np.float32] = 0.0) -> Gau
         arrays["rest"][part, : values.rest.shape[1]] = values.rest
         for name in ("dc", "opacity_logits", "log_scales", "quats"):
             arrays[name][part] = getattr(values, name)
+
+    each_of(fill, range(0, n, ROWS_AT_ONCE), rows=n)
     arrays["log_scales"] += np.asarray(swell, dtype=np.float32)
     arrays["dc"] = arrays["dc"][:, None, :]
     return gaussians_of(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -37,8 +38,12 @@ class Basis:
 
     def to(self, rest: NDArray[Any]) -> Array:
         """Coordinates [N,K] of coefficients [N,K]."""
-        found: Array = rest @ np.linalg.inv(self.matrix.astype(np.float64) / UNIT)
+        found: Array = rest @ self._inverse
         return found
+
+    @cached_property
+    def _inverse(self) -> Array:
+        return np.linalg.inv(self.matrix.astype(np.float64) / UNIT)
 
     def pays(self, count: int, step: float) -> bool:
         """Whether it saves more than it takes for so many rows: bits of normal numbers, about."""
