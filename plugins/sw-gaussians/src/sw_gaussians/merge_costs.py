@@ -67,8 +67,10 @@ def closeness(a: Columns, b: Columns) -> Tensor:
     return _quadratic(six, b.places - a.places, _det(six))
 
 
-def prices(a: Columns, b: Columns) -> Tensor:
+def prices(a: Columns, b: Columns, apart: Tensor | None = None) -> Tensor:
     """Return the price [N] >= 0 of merging each of `a` with its partner in `b`, by moments and the ink rule.
+
+    apart   [N] squared distance of their higher bands; None: of those of the columns
 
     The integral of the squared difference of opacity times colour times the Gaussian, before and after, over all
     space, in cubes of the unit, and the difference of their colours at COLOR_PRICE.
@@ -90,7 +92,8 @@ def prices(a: Columns, b: Columns) -> Tensor:
     field = field + 2 * at * bt * _dot(a.colors, b.colors) * _product(a.volumes, b.volumes, a.six + b.six, d)
     field = field - 2 * at * mt * _dot(a.colors, colors) * _product(a.volumes, volumes, a.six + six, other * d)
     field = field - 2 * bt * mt * _dot(b.colors, colors) * _product(b.volumes, volumes, b.six + six, share * d)
-    apart = ((a.colors - b.colors) ** 2).sum(dim=0) + ((a.rest - b.rest) ** 2).sum(dim=0) / (4 * math.pi)
+    apart = ((a.rest - b.rest) ** 2).sum(dim=0) if apart is None else apart
+    apart = ((a.colors - b.colors) ** 2).sum(dim=0) + apart / (4 * math.pi)
     found: Tensor = (2 * math.pi) ** 1.5 * field.clamp_min(0) + COLOR_PRICE * apart
     return found
 

@@ -35,10 +35,10 @@ PAIRS_AT_ONCE = {"cpu": 1 << 14, "cuda": 1 << 17}
 """Pairs that merge together: in float64 each takes some kB on the way, which stay in the cache of a core."""
 COEFFICIENTS_AT_ONCE = 4
 """Spherical harmonics that are put into another order together: they are most of a Gaussian."""
-ROWS_AT_ONCE = {"cpu": 1 << 14, "cuda": 1 << 22}
+ROWS_AT_ONCE = {"cpu": 1 << 14, "cuda": 1 << 21}
 """Pairs whose prices are found together: intermediate columns stay in the cache of a core."""
-MEASURED = 1 << 17
-"""Gaussians by which the size of a scene is told."""
+MEASURED = {"cpu": 1 << 17, "cuda": 1 << 15}
+"""Gaussians by which the size of a scene is told: they are sorted on the CPU."""
 
 
 @torch.no_grad()
@@ -181,7 +181,7 @@ def levels_of(model: GaussianModel, levels: int | None = None) -> Iterator[Gauss
 
 def _unit(splats: Splats) -> float:
     """Size of the scene: the radius that holds half of what is visible, by Gaussians from everywhere in it."""
-    some = slice(None, None, max(len(splats.means) // MEASURED, 1))
+    some = slice(None, None, max(len(splats.means) // _at_once(MEASURED, splats.means), 1))
     sizes = splats.scales[some].double().sort(dim=1, descending=True).values
     areas = splats.opacities[some].double() * sizes[:, 0] * sizes[:, 1]
     points, weights, widths = (values.cpu().numpy() for values in (splats.means[some].double(), areas, sizes[:, 0]))
@@ -222,33 +222,47 @@ def _native_partners(pool: _Pool, near: float, wave: int) -> tuple[Tensor, Tenso
 def _partners(pool: _Pool, near: float, wave: int) -> tuple[Tensor, Tensor]:
     """The price [n] of the cheapest neighbour of each place of the curve, infinite if none is near, and its place [n],
     then its own."""
-    columns, weights = pool.columns(pool.order), None if pool.weights is None else pool.weights[pool.order]
-    n, device = len(columns.opacities), columns.places.device
-    best = torch.full((n,), math.inf, dtype=columns.places.dtype, device=device)
-    partner = torch.arange(n, device=device)
-    step = _at_once(ROWS_AT_ONCE, best)
+    n, device = len(pool.order), pool.table.device
+    best = torch.full((n,), math.inf, dtype=pool.table.dtype, device=device)
+    places = torch.arange(n, device=device)
+    partner = places.clone()
+    rows = torch.cat([pool.order, pool.order[-1:].expand(WINDOW)])  # the last ones have as many neighbours
+    columns, weights = pool.columns(rows), None if pool.weights is None else pool.weights[rows]
+    step = _at_once(ROWS_AT_ONCE, best) // WINDOW
     for start in range(0, n, step):
-        for offset in range(1, WINDOW + 1):
-            end = min(start + step, n - offset)
-            if end <= start:
-                break
-            a, b = columns.part(start, end), columns.part(start + offset, end + offset)
-            price = prices(a, b).nan_to_num(nan=3e38, posinf=3e38)
-            rows = torch.arange(start, end, device=device)
-            if weights is not None:
-                price = price * (weights[start:end] + weights[start + offset : end + offset]) / 2
-            # Equal prices, as of copies, would have all point the same way.
-            price = price * (1 + 1e-5 * _lot(rows, offset, wave)) + 1e-30 * _lot(rows, offset, wave + 1)
-            price = torch.where(closeness(a, b) < near, price, math.inf)
-            for ours, theirs in ((rows, rows + offset), (rows + offset, rows)):
-                here = slice(int(ours[0]), int(ours[-1]) + 1)
+        end = min(start + step, n)
+        found = _prices_ahead(columns, weights, start, end, near, wave)
+        for offset, price in enumerate(found, 1):
+            price = price[: max(n - offset - start, 0)]
+            for ours, theirs in ((start, start + offset), (start + offset, start)):
+                here = slice(ours, ours + len(price))
                 better = price < best[here]
                 best[here] = torch.where(better, price, best[here])
-                partner[here] = torch.where(better, theirs, partner[here])
+                partner[here] = torch.where(better, places[theirs : theirs + len(price)], partner[here])
     return best, partner
 
 
-def _lot(rows: Tensor, offset: int, wave: int) -> Tensor:
+def _prices_ahead(
+    columns: Columns, weights: Tensor | None, start: int, end: int, near: float, wave: int
+) -> Tensor:  # fmt: skip
+    """Prices [WINDOW,n] of the places `start` to `end` of the curve with each of the next ones; infinite if far."""
+    ahead = [slice(start + offset, end + offset) for offset in range(1, WINDOW + 1)]
+    apart = torch.stack([(columns.rest[:, start:end] - columns.rest[:, some]).square().sum(dim=0) for some in ahead])
+    alone = columns._replace(rest=columns.rest[:0])
+    ours, others = alone.part(start, end), [alone.part(some.start, some.stop) for some in ahead]
+    a = Columns(*(torch.cat([each] * WINDOW, dim=-1) for each in ours))
+    b = Columns(*(torch.cat(each, dim=-1) for each in zip(*others, strict=True)))
+    price = prices(a, b, apart.flatten()).nan_to_num(nan=3e38, posinf=3e38)
+    price = torch.where(closeness(a, b) < near, price, math.inf).view(WINDOW, -1)
+    if weights is not None:
+        price = price * ((weights[start:end] + torch.stack([weights[some] for some in ahead])) / 2)
+    rows = torch.arange(start, end, device=price.device)
+    offset = torch.arange(1, WINDOW + 1, device=price.device)[:, None]
+    # Equal prices, as of copies, would have all point the same way.
+    return price * (1 + 1e-5 * _lot(rows, offset, wave)) + 1e-30 * _lot(rows, offset, wave + 1)
+
+
+def _lot(rows: Tensor, offset: Tensor, wave: int) -> Tensor:
     """A number in 0..1 for each pair, as good as drawn and the same on every machine."""
     mixed = (rows * 2654435761 + offset * 40503 + wave * 97) & 0xFFFFFFFF
     mixed = ((mixed ^ (mixed >> 15)) * 2246822519) & 0xFFFFFFFF
