@@ -7,7 +7,14 @@ import math
 import numpy as np
 import pytest
 import torch
-from sw_gaussians.made_up_cameras import MadeUpCameras, plausible_cameras, weighted_quantiles
+from sw_gaussians.made_up_cameras import (
+    MadeUpCameras,
+    extent_of,
+    extent_on_gpu,
+    plausible_cameras,
+    quantiles_on_gpu,
+    weighted_quantiles,
+)
 from sw_gaussians.ring_cameras import ring_cameras, ring_extent
 from sw_reference.rasterizer import ReferenceRasterizer
 
@@ -133,6 +140,25 @@ def test_nothing_to_see_is_an_error():
 def test_weighted_quantiles_count_weights():
     found = weighted_quantiles(np.array([3.0, 1.0, 2.0]), np.array([1.0, 1.0, 8.0]), (0.05, 0.5, 1.0))
     assert found.tolist() == [1.0, 2.0, 3.0]
+
+
+def test_extents_on_a_gpu_are_those_of_arrays():
+    random = np.random.default_rng(0)
+    points, areas, sizes = random.normal(size=(6000, 3)), random.lognormal(size=6000), random.lognormal(-4, 1, 6000)
+    known, found = extent_of(points, areas, sizes), extent_on_gpu(*map(torch.from_numpy, (points, areas, sizes)))
+    assert found.center.tolist() == known.center.tolist()
+    assert (found.r50, found.r80, found.r95) == pytest.approx((known.r50, known.r80, known.r95), rel=1e-12)
+    same = quantiles_on_gpu(torch.tensor([3.0, 1.0, 2.0]), torch.tensor([1.0, 1.0, 8.0]).double(), (0.05, 0.5, 1.0))
+    assert same.tolist() == [1.0, 2.0, 3.0]
+
+
+@pytest.mark.cuda
+def test_cameras_on_a_gpu_are_those_on_the_cpu():
+    found, known = made(ROOM.cuda(), widest=640), made(ROOM, widest=640)
+    assert found.kind == known.kind
+    for ours, theirs in zip(found.fit + found.held_out, known.fit + known.held_out, strict=True):
+        assert (ours.width, ours.height) == (theirs.width, theirs.height)
+        assert ours.pose == pytest.approx(theirs.pose, abs=1e-4)
 
 
 def cube(n: int = 21) -> GaussianModel:

@@ -125,8 +125,8 @@ class Quantized:
         return Steps(self.steps(levels), int(POSITION_BITS - levels[POSITIONS]))
 
     @torch.no_grad()
-    def sizes(self, model: GaussianModel) -> dict[str, NDArray[np.float64]]:
-        """Bytes of each attribute at each of its levels, from entropies; nothing is coded."""
+    def sizes(self, model: GaussianModel, *, coarsest: bool = False) -> dict[str, NDArray[np.float64]]:
+        """Bytes of each attribute at each of its levels, or the `coarsest`, from entropies; nothing is coded."""
         count = model.num_rows
         part = model
         if count > SAMPLE:
@@ -135,20 +135,14 @@ class Quantized:
         rounding = Rounding(part, self.power, OWN_BASIS)
         scale = count / max(part.num_rows, 1)
         sections = _Sections(rounding, suitable_classes(count), TABLE_BITS / scale)
-        found = {POSITIONS: self._position_sizes(model)}
+        some = slice(-1 if coarsest else None, None)
+        found = {POSITIONS: _position_sizes(model, POSITION_LEVELS[some])}
         for name in self.attributes(model):
             if name != POSITIONS:
-                steps = [Steps({name: STEPS[name] * 2.0**level}, POSITION_BITS) for level in self.levels(name)]
+                steps = [Steps({name: STEPS[name] * 2.0**level}, POSITION_BITS) for level in self.levels(name)[some]]
                 found[name] = np.array([sections.bits(name, each) for each in steps]) * scale / 8
         found["dc"] += sections.precision_bits() * scale / 8
         return found
-
-    def _position_sizes(self, model: GaussianModel) -> NDArray[np.float64]:
-        finest = int(POSITION_BITS - POSITION_LEVELS[0])
-        means = model.means.detach()
-        cells = cells_of(means, replace(grid_of(means), bits=finest)).long()
-        bits = octree_bits(interleave(cells).sort().values, finest)
-        return np.array([bits[int(POSITION_BITS - level)] / 8 for level in POSITION_LEVELS])
 
     def encode(self, model: GaussianModel, levels: Levels, path: Path) -> int:
         """Write the file; return its bytes."""
@@ -163,6 +157,14 @@ class Quantized:
         settings = self.settings(levels).model_dump()
         numbers = {key: value for key, value in settings.items() if not isinstance(value, str)}
         return CodecChoice(name="gaussians-quantized", settings=numbers)
+
+
+def _position_sizes(model: GaussianModel, levels: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Bytes of the positions at ascending levels."""
+    finest, means = int(POSITION_BITS - levels[0]), model.means.detach()
+    cells = cells_of(means, replace(grid_of(means), bits=finest)).long()
+    bits = octree_bits(interleave(cells).sort().values, finest)
+    return np.array([bits[int(POSITION_BITS - level)] / 8 for level in levels])
 
 
 class _Sections:

@@ -297,10 +297,13 @@ def entropy_bits(symbols: Tensor, classes: Tensor, count: int, table_bits: float
         return 0.0
     n, columns = symbols.shape
     low, high = symbols.aminmax(dim=0)
+    spans = [int(b - a) for a, b in zip(*torch.stack([low, high]).tolist(), strict=True)]
     # Where values are many, their low bits go raw; a matrix has few columns, so places fit 32 bits.
-    shift = torch.tensor([max(int(each).bit_length() - 12, 0) for each in (high - low).tolist()], dtype=torch.int32)
-    width = int(((high - low).cpu() >> shift).max()) + 1
-    places = (symbols - low).bitwise_right_shift_(shift.to(symbols.device))
+    shifts = [max(span.bit_length() - 12, 0) for span in spans]
+    width = max(span >> shift for span, shift in zip(spans, shifts, strict=True)) + 1
+    places = symbols - low
+    if any(shifts):
+        places.bitwise_right_shift_(torch.tensor(shifts, dtype=torch.int32, device=symbols.device))
     places += (width * columns * classes.int())[:, None]
     places += width * torch.arange(columns, dtype=torch.int32, device=places.device)
     counts = torch.bincount(places.flatten(), minlength=width * columns * count).reshape(count, columns, width)
@@ -308,7 +311,7 @@ def entropy_bits(symbols: Tensor, classes: Tensor, count: int, table_bits: float
     distinct = (counts > 0).sum(2)
     own = torch.special.entr(counts.double()).sum(2) + torch.special.xlogy(rows.double(), rows.double())
     bits = own / math.log(2) + table_bits * distinct * (distinct > 1)
-    return float(bits.sum() + (shift * n).sum())
+    return float(bits.sum()) + n * sum(shifts)
 
 
 def equal_classes(values: Tensor, count: int) -> Tensor:

@@ -137,6 +137,7 @@ class Choice:
 def for_size(search: Search, budget: float) -> Choice | None:
     """The best picture in a file of an estimated `budget` bytes; None where nothing is so small."""
     best: tuple[int, list[Curve], Allocation] | None = None
+    held: Choice | None = None
     best_error, worse, choice = math.inf, 0, None
     for count in search.parts():
         choice = None  # its Gaussians go before the next ones are made
@@ -144,12 +145,13 @@ def for_size(search: Search, budget: float) -> Choice | None:
         if choice is not None:
             if error < best_error:
                 best, best_error, worse = (count, choice.curves, choice.allocation), error, 0
+                held = choice if choice.model.device.type != "cpu" else None
             else:
                 choice, worse = None, worse + 1
         if worse == PATIENCE or last:
             break
-    if best is None or choice is not None:
-        return choice
+    if best is None or choice is not None or held is not None:
+        return choice or held
     count, curves, allocation = best
     return Choice(search.gaussians(count), curves, allocation)
 
@@ -179,7 +181,7 @@ def check_in_reach(coder: Quantized, model: GaussianModel, count: int | None, si
     count = parts_of(model.num_rows, count)[-1]
     few = torch.arange(0, model.num_rows, max(1, model.num_rows // count))
     part = select(model, few.to(model.device)[:count])
-    least = FIXED_BYTES + sum(float(each[-1]) for each in coder.sizes(part).values())
+    least = FIXED_BYTES + sum(float(each[-1]) for each in coder.sizes(part, coarsest=True).values())
     if least > 2 * size:
         raise too_small(size, f"about {least:,.0f}")
 

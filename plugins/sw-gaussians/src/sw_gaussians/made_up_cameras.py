@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from splatwizard_core.api import Camera, GaussianModel, RasterOptions, SceneError
 from sw_gaussians.render_options import antialias_of, eps2d_of
@@ -95,6 +96,7 @@ class _Judged:
 
     model       the weightiest ones
     points, middles, areas      [n,3], [n], [n]: places, middle scale, opacity times product of the two largest scales
+    beside      the same on a GPU; None: there is none
     """
 
     model: GaussianModel
@@ -103,6 +105,7 @@ class _Judged:
     areas: Array
     rasterizer: Rasterizer
     options: RasterOptions
+    beside: tuple[Tensor, Tensor, Tensor] | None = None
 
     def opacity(self, camera: Camera) -> Array:
         """Accumulated opacity [H,W] of a view."""
@@ -183,23 +186,44 @@ def _weighted_quantile(values: Array, weights: Array, wanted: float) -> float:
     return float(values[order][min(place, len(values) - 1)])
 
 
+def extent_on_gpu(points: Tensor, areas: Tensor, sizes: Tensor) -> Extent:
+    """As `extent_of`, of tensors where they are."""
+    center = torch.cat([quantiles_on_gpu(axis, areas, (0.5,)) for axis in points.unbind(1)])
+    radii = (points - center).square().sum(dim=1).sqrt()
+    floor = 3 * quantiles_on_gpu(sizes, areas, (0.5,))
+    r50, r80, r95 = quantiles_on_gpu(radii, areas, (0.5, 0.8, 0.95)).maximum(floor.clamp_min(1e-12)).tolist()
+    return Extent(center.cpu().numpy(), r50, r80, r95)
+
+
+def quantiles_on_gpu(values: Tensor, weights: Tensor, shares: tuple[float, ...]) -> Tensor:
+    """As `weighted_quantiles`, of tensors [n] where they are. Sums are of integers: those of floats vary from run to
+    run."""
+    order = values.argsort(stable=True)
+    total = (weights[order] * (2.0**52 / weights.sum())).long().cumsum(dim=0)
+    wanted = torch.tensor(shares, dtype=torch.float64, device=values.device) * total[-1]
+    found: Tensor = values[order[torch.searchsorted(total, wanted.ceil().long()).clamp_max(len(values) - 1)]]
+    return found
+
+
 def _judged(model: GaussianModel, rasterizer: Rasterizer) -> tuple[_Judged, Extent]:
     with torch.no_grad():
-        scales = model.scales.double().sort(dim=1, descending=True).values.cpu().numpy()
-        opacities = model.opacities.double().cpu().numpy()
-        points = model.means.double().cpu().numpy()
-    areas = opacities * scales[:, 0] * scales[:, 1]
-    sound = np.isfinite(points).all(1) & np.isfinite(areas) & (areas > 0)
-    if not sound.any():
-        raise SceneError("no Gaussian is opaque and finite, so there is nothing to look at")
-    extent = extent_of(points[sound], areas[sound], scales[sound, 0])
-    rows = np.flatnonzero(sound)
-    if len(rows) > MOST_JUDGED:
-        rows = np.sort(rows[np.argsort(-areas[rows], kind="stable")[:MOST_JUDGED]])
-    part = select(model, torch.from_numpy(rows).to(model.device))
-    options = RasterOptions(alpha=True, antialias=antialias_of(model), eps2d=eps2d_of(model))
-    middles = scales[rows, 1]
-    return _Judged(part, points[rows], middles, areas[rows], rasterizer, options), extent
+        scales = model.scales.double().sort(dim=1, descending=True).values
+        opacities = model.opacities.double()
+        points = model.means.double()
+        areas = opacities * scales[:, 0] * scales[:, 1]
+        sound = points.isfinite().all(dim=1) & areas.isfinite() & (areas > 0)
+        rows = sound.nonzero().squeeze(1)
+        if not len(rows):
+            raise SceneError("no Gaussian is opaque and finite, so there is nothing to look at")
+        sizes, on_gpu = scales[rows, 0], model.device.type != "cpu"
+        measured = points[rows], areas[rows], sizes
+        extent = extent_on_gpu(*measured) if on_gpu else extent_of(*(each.numpy() for each in measured))
+        if len(rows) > MOST_JUDGED:
+            rows = rows[(-areas[rows]).argsort(stable=True)[:MOST_JUDGED]].sort().values
+        options = RasterOptions(alpha=True, antialias=antialias_of(model), eps2d=eps2d_of(model))
+        kept = points[rows], scales[rows, 1], areas[rows]
+        arrays = (each.cpu().numpy() for each in kept)
+        return _Judged(select(model, rows), *arrays, rasterizer, options, kept if on_gpu else None), extent
 
 
 def _cameras(
@@ -263,16 +287,33 @@ def _camera(judged: _Judged, eye: Array, target: Array, up: Array, extent: Exten
     given = [torch.from_numpy(np.ascontiguousarray(each)).float() for each in (eye, target, _upright(eye, target, up))]
     width, height = _size(WIDTHS[0])
     camera = Camera.look_at(*given, width=width, height=height, fov_x=FOV, near=NEAR * extent.r80)
+    size = _median_size(judged, camera) if judged.beside is None else _median_size_on_gpu(*judged.beside, camera)
+    if size is None:
+        return camera
+    focal = 1 / max(size, 1e-12)
+    low, high = WIDTHS[0], max(WIDTHS[0], min(widest, WIDTHS[1]))
+    return camera.resized(*_size(min(max(2 * focal * math.tan(FOV / 2), low), high)))
+
+
+def _median_size(judged: _Judged, camera: Camera) -> float | None:
+    """Middle scale over depth of the median of what a camera has before it; None: there is nothing."""
     local = judged.points @ camera.R.double().numpy().T + camera.tau.double().numpy()
     x, y, z = np.abs(local[:, 0]), np.abs(local[:, 1]), local[:, 2]
     tx, ty = camera.tan_half_fov
     inside = (z > camera.near) & (x < tx * z) & (y < ty * z)
     if not inside.any():
-        return camera
-    size = float(weighted_quantiles(judged.middles[inside] / z[inside], judged.areas[inside], (0.5,))[0])
-    focal = 1 / max(size, 1e-12)
-    low, high = WIDTHS[0], max(WIDTHS[0], min(widest, WIDTHS[1]))
-    return camera.resized(*_size(min(max(2 * focal * math.tan(FOV / 2), low), high)))
+        return None
+    return float(weighted_quantiles(judged.middles[inside] / z[inside], judged.areas[inside], (0.5,))[0])
+
+
+def _median_size_on_gpu(points: Tensor, middles: Tensor, areas: Tensor, camera: Camera) -> float | None:
+    local = points @ camera.R.double().to(points.device).T + camera.tau.double().to(points.device)
+    x, y, z = local.unbind(1)
+    tx, ty = camera.tan_half_fov
+    inside = (z > camera.near) & (x.abs() < tx * z) & (y.abs() < ty * z)
+    if not bool(inside.any()):
+        return None
+    return float(quantiles_on_gpu(middles[inside] / z[inside], areas[inside], (0.5,)))
 
 
 def _size(width: float) -> tuple[int, int]:
