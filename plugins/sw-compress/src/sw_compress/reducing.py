@@ -16,6 +16,7 @@ from sw_gaussians.simplifying import merged_by
 from splatwizard_core.api import GaussianModel
 from sw_codecs.models.quantized import FAINTEST
 from sw_compress.rows import IMPORTANCE, like, select
+from sw_compress.stages import give_back
 
 if TYPE_CHECKING:
     from sw_compress.pruning import Pruning
@@ -76,6 +77,7 @@ class Reduction:
         return max(count, round(whole * (count / whole) ** power))
 
     def _by(self, count: int, power: float) -> GaussianModel:
+        give_back()  # what drawing holds on to
         rows = self.pruning.rows(self._kept(count, power))
         if len(rows) > count and power < 1:
             merged, weights = merged_by(self.model, rows, count, self._weights()[rows])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -11,6 +10,7 @@ from pathlib import Path
 
 import psutil
 import torch
+from sw_gaussians import heap
 
 from sw_rasterizers import memory
 
@@ -40,8 +40,7 @@ class Stages:
 def give_back() -> None:
     """Return free memory to the system, where the rasterizer or the C library hold on to it."""
     memory.give_back()
-    with contextlib.suppress(OSError, AttributeError, TypeError):  # glibc has it
-        ctypes.CDLL(None).malloc_trim(0)
+    heap.trim()
 
 
 def peak_bytes(device: torch.device) -> int:

@@ -69,12 +69,14 @@ def splats_of(model: GaussianModel, rows: Tensor | None = None) -> Splats:
                   sh)  # fmt: skip
 
 
-def model_of(splats: Splats, like: GaussianModel) -> GaussianModel:
-    """A model in float32 of Gaussians [N], fixed, with what the file of `like` told."""
-    opacities = splats.opacities.double().clamp(1e-6, 1 - 1e-6)
-    raw = (splats.means, splats.sh[:, :1], splats.sh[:, 1:], torch.logit(opacities),
-           splats.scales.double().clamp(1e-38, 3e38).log(), splats.quats)  # fmt: skip
-    model = GaussianModel.from_tensors(*(values.float() for values in raw))
+def model_of(splats: Splats, rows: Tensor, like: GaussianModel) -> GaussianModel:
+    """A model in float32 of some Gaussians, fixed, with what the file of `like` told; shares no memory with them."""
+    opacities = splats.opacities[rows].double().clamp(1e-6, 1 - 1e-6)
+    scales = splats.scales[rows].double().clamp(1e-38, 3e38)
+    # Spherical harmonics are copied once: they are most of what there is.
+    dc, rest = (splats.sh[:, some].index_select(0, rows).float() for some in (slice(1), slice(1, None)))
+    raw = (splats.means[rows], dc, rest, torch.logit(opacities), scales.log(), splats.quats[rows])
+    model = GaussianModel(*(values.float() for values in raw))
     model.origin = like.origin
     return model.eval().requires_grad_(False)
 

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from splatwizard_core.api import GaussianModel
 from sw_gaussians import face
+from sw_gaussians.heap import trim
 from sw_gaussians.made_up_cameras import extent_of
 from sw_gaussians.merge_costs import Columns, closeness, columns_of, prices
 from sw_gaussians.merging import Splats, merge_groups, model_of, splats_of
@@ -54,8 +55,8 @@ def merged_to(
     The result is a new model without the SH bands that were not active; one that is small enough already is copied.
     Raises ShapeError for surfels.
     """
-    splats, _ = _reduced(splats_of(model), count, significance, widen)
-    return model_of(splats, model)
+    splats, _, left = _reduced(splats_of(model), count, significance, widen)
+    return model_of(splats, left, model)
 
 
 @torch.no_grad()
@@ -66,17 +67,25 @@ def merged_by(
 
     significance    [M] of these rows; of the result it is the sum over what it stands for
     """
-    splats, weights = _reduced(splats_of(model, rows), count, significance, widen)
+    splats, weights, left = _reduced(splats_of(model, rows), count, significance, widen)
     assert weights is not None  # they were given
-    return model_of(splats, model), weights.to(significance) * significance.median().clamp_min(1e-30)
+    found = weights[left].to(significance) * significance.median().clamp_min(1e-30)
+    return model_of(splats, left, model), found
 
 
-def _reduced(splats: Splats, count: int, significance: Tensor | None, widen: bool) -> tuple[Splats, Tensor | None]:
-    """At most so many Gaussians, and what they weigh in medians; overwrites the SH of those given."""
+def _reduced(
+    splats: Splats, count: int, significance: Tensor | None, widen: bool
+) -> tuple[Splats, Tensor | None, Tensor]:
+    """Merge until at most so many are left: all rows, what they weigh in medians, and which are left [n].
+
+    Overwrites the SH of those given.
+    """
     weights = None if significance is None else (significance / significance.median().clamp_min(1e-30)).to(splats.means)
     pool = _Pool.of(splats, weights)
+    del splats  # the pool has a copy of all but SH
     near, wave = NEAR, 0
     while (n := len(pool.order)) > max(count, 1):
+        trim()
         pool.follow_curve(wave)
         pairs = _wave(pool, near, wave)
         pairs = pairs[: min(n - count, math.ceil(TAKEN * len(pairs)))]
@@ -84,9 +93,9 @@ def _reduced(splats: Splats, count: int, significance: Tensor | None, widen: boo
             near *= 4
         pool.merge(pairs, widen)
         wave += 1
-    left, splats, weights = pool.order, pool.splats, pool.weights
-    del pool  # its table goes before what is left is copied
-    return splats.rows(left), None if weights is None else weights[left]
+        del pairs
+    trim()
+    return pool.splats, pool.weights, pool.order
 
 
 @dataclass
