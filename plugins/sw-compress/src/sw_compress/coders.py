@@ -25,7 +25,7 @@ from sw_compress.rounding import Rounding, Steps, cells_of, entropy_bits, equal_
 from sw_compress.rows import IMPORTANCE, select
 
 if TYPE_CHECKING:
-    from splatwizard_core.api import PluginManager
+    from splatwizard_core.api import Method, PluginManager
 
 Levels = Mapping[str, float]
 
@@ -146,11 +146,14 @@ class Quantized:
 
     def encode(self, model: GaussianModel, levels: Levels, path: Path) -> int:
         """Write the file; return its bytes."""
+        origin = self.origin or model.world_origin or (0.0, 0.0, 0.0)
+        return encode_model(self.method_of(levels), model, dict(self.raster), path, origin).bytes
+
+    def method_of(self, levels: Levels) -> Method:
+        """The method that the file is of."""
         codec = self.choice(levels)
         values = {"codec.name": codec.name, **{f"codec.settings.{key}": value for key, value in codec.settings.items()}}
-        method = create_method(self.plugins, self.method, values)
-        origin = self.origin or model.world_origin or (0.0, 0.0, 0.0)
-        return encode_model(method, model, dict(self.raster), path, origin).bytes
+        return create_method(self.plugins, self.method, values)
 
     def choice(self, levels: Levels) -> CodecChoice:
         """The codec that writes the file, with its settings."""

@@ -17,6 +17,8 @@ from splatwizard_core.tooling import OUTPUT_FILE, NegotiatedRasterizer, choose_d
 from sw_compress.coders import PRECISE_FROM, Quantized
 from sw_compress.filling import Filled, fill
 from sw_compress.formats import FORMATS, FormatFile, format_file
+from sw_compress.large import Asked, WrittenLarge, large_file, write_large
+from sw_compress.large_scene import LargeScene
 from sw_compress.measuring import Errors
 from sw_compress.pruning import Pruning
 from sw_compress.quality import PHOTOGRAPHS, Pictures, loss_against_photographs, told_loss
@@ -40,13 +42,13 @@ class Compressed:
 
     out     the file; None where its bytes were asked for
     data    the bytes; None where a file was asked for
-    model   as the file decodes
+    model   as the file decodes; of a large one what is drawn of it, its higher harmonics in a file
     record  bytes by section, counts, precision, quality, cameras, seconds: JSON values
     """
 
     out: Path | None
     data: bytes | None
-    model: GaussianModel
+    model: GaussianModel | LargeScene
     record: dict[str, Any]
 
 
@@ -111,8 +113,9 @@ def compress(
             place = Path(beside.enter_context(replacing(out)))
         else:
             place = Path(beside.enter_context(tempfile.TemporaryDirectory(prefix="sw-compress-"))) / f"scene.{format}"
-        written = _written(scene, asked, place)
+        written = _written_in_two_passes(scene, asked, place) or _written(scene, asked, place)
         # Only now, when neither source nor search are in memory.
+        made: GaussianModel | LargeScene
         made, facts = written.opened(place, asked)
         data = place.read_bytes() if out is None else None
     with stages.timed("check"):
@@ -179,6 +182,24 @@ class _Written:
             model, reader = open_model(path, asked.plugins, asked.device)
         assert isinstance(model, GaussianModel)  # of a method of explicit Gaussians
         return model, {"sections": {"header": reader.header_bytes, **reader.sections}}
+
+
+def _written_in_two_passes(
+    scene: str | os.PathLike[str] | GaussianModel, asked: _Asked, path: Path
+) -> WrittenLarge | None:
+    """Write the file of a source that is too large for memory; None for any other source, or kind of result."""
+    if isinstance(scene, GaussianModel) or asked.format != SWZ or asked.refine:
+        return None
+    given = Path(scene)
+    blocks = large_file(given, asked.device)
+    if blocks is None:
+        return None
+    target = Target.of(asked.size, asked.quality, asked.ratio, given.stat().st_size)
+    how = Asked(
+        target, asked.given, asked.views, asked.gaussians, asked.sh_degree, asked.drop_unseen, asked.device,
+        asked.plugins, asked.stages, asked.say,
+    )  # fmt: skip
+    return write_large(blocks, how, path)
 
 
 def _written(scene: str | os.PathLike[str] | GaussianModel, asked: _Asked, path: Path) -> _Written:

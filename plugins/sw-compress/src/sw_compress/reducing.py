@@ -64,23 +64,28 @@ class Reduction:
 
     def pruned(self, count: int) -> int:
         """Count those removed to come to so many; the others that are gone have merged."""
-        kept = self._kept(count, POWERS[self._place(count)])
+        kept = self.kept(count, self.power(count))
         return self.model.num_rows - len(self.pruning.rows(kept))
+
+    def power(self, count: int) -> float:
+        """The power that was chosen for so many, or for the next larger number."""
+        return POWERS[self._place(count)]
 
     def _place(self, count: int) -> int:
         """Place of the power that was chosen for so many, or for the next larger number."""
         more = [each for each in self._chosen if each >= count]
         return self._chosen[min(more)] if more else 0
 
-    def _kept(self, count: int, power: float) -> int:
+    def kept(self, count: int, power: float) -> int:
+        """How many removals leave; the rest of what is too many merges."""
         whole = self.model.num_rows
         return max(count, round(whole * (count / whole) ** power))
 
     def _by(self, count: int, power: float) -> GaussianModel:
         give_back()  # what drawing holds on to
-        rows = self.pruning.rows(self._kept(count, power))
+        rows = self.pruning.rows(self.kept(count, power))
         if len(rows) > count and power < 1:
-            merged, weights = merged_by(self.model, rows, count, self._weights()[rows])
+            merged, weights = merged_by(self.model, rows, count, self.weights()[rows])
             found = like(self.model, merged)
             drawn = found.opacity_logits >= FAINTEST  # of some that merged so little is left that nothing is drawn
             if not bool(drawn.all()):
@@ -90,7 +95,7 @@ class Reduction:
         setattr(found, IMPORTANCE, weights)
         return found
 
-    def _weights(self) -> torch.Tensor:
+    def weights(self) -> torch.Tensor:
         """Weights of the Gaussians in pictures [N]; of what none shows, and must not go, as much as the median."""
         known = self.pruning.importance
         shown = known[known > 0]

@@ -41,10 +41,11 @@ def load_ply(path: str | os.PathLike[str]) -> GaussianModel:
     return from_ply(memory_map(path), os.fspath(path))
 
 
-def from_ply(data: bytes | memoryview, path: str) -> GaussianModel:
+def from_ply(data: bytes | memoryview, path: str, *, tell: bool = True) -> GaussianModel:
     """Read a model from the bytes of a file, as `load_ply` does.
 
     path    what errors call it: where it lies, if it lies anywhere
+    tell    log what a reader should know
     """
     found = parse_gaussians(data, path)
     if found.sh_rest.shape[1] > 15:
@@ -53,7 +54,7 @@ def from_ply(data: bytes | memoryview, path: str) -> GaussianModel:
             "are possible",
             path=path,
         )
-    for note in found.notes:
+    for note in found.notes if tell else ():
         log.warning("%s: %s", Path(path).name, note)
     columns = (found.means, found.sh_dc[:, None], found.sh_rest, found.opacity_logits, found.log_scales, found.quats)
     model = gaussians_of(*(torch.from_numpy(column) for column in columns))
@@ -61,7 +62,7 @@ def from_ply(data: bytes | memoryview, path: str) -> GaussianModel:
         model.origin = {"antialiased": True, "raster": {"antialias": True}}
     if found.world_origin is not None:
         model.origin = {**model.origin, "world_origin": list(found.world_origin)}
-    return leave_out_senseless(model, Path(path).name)
+    return leave_out_senseless(model, Path(path).name, tell=tell)
 
 
 def export_ply(model: SplatModel, path: str | os.PathLike[str]) -> None:

@@ -1,0 +1,319 @@
+"""Files of more Gaussians than are held in memory at once, in two passes.
+
+The first pass reads what is drawn without higher spherical harmonics of all Gaussians, makes up cameras, and ranks them
+by what they change in pictures of the whole scene. How many stay, and how precise they are, is searched for on a sample
+of runs from everywhere, drawn among coarse stand-ins of all others: its errors and bytes are a share of those of the
+whole. The second pass reduces and writes tile by tile.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from sw_gaussians.ply_blocks import PlyBlocks, blocks_of
+from sw_gaussians.render_options import antialias_of, raster_of
+from sw_gaussians.simplifying import merged_by
+from torch import Tensor
+
+from splatwizard_core.api import ContainerReader, GaussianModel, RasterOptions, UserInputError, track
+from splatwizard_core.tooling import NegotiatedRasterizer
+from sw_codecs.models.quantized import FAINTEST
+from sw_compress import coders
+from sw_compress.allocation import of_error
+from sw_compress.among import Among, coarse, sample_rows, without
+from sw_compress.coders import FIXED_BYTES, Quantized
+from sw_compress.filling import AIM, MOST_ENCODES
+from sw_compress.large_scene import LargeScene, read_scene
+from sw_compress.measuring import Errors
+from sw_compress.pruning import Pruning
+from sw_compress.quality import Pictures, decibels
+from sw_compress.reducing import Reduction
+from sw_compress.rows import IMPORTANCE, like, select, with_degree
+from sw_compress.search import Choice, Search, for_quality, for_size, too_small
+from sw_compress.shelf import Shelf
+from sw_compress.targets import LEAST_SHARE, QUALITY_MARGIN, Target
+from sw_compress.tiled_file import TiledFile, tiles_of
+from sw_compress.views import Views, made_up_views
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from splatwizard_core.api import PluginManager, Rasterizer
+    from sw_compress.stages import Stages
+
+LARGE = {"cpu": 4_000_000, "cuda": 16_000_000}
+"""Gaussians above which a file is made small in two passes, by kind of device."""
+LEAST_ROW = 56
+"""Bytes of a Gaussian in a .ply, at least."""
+SAMPLE, RUN = 1 << 18, 1 << 12
+"""Gaussians that are searched with, and how many of them lie side by side."""
+QUALITY_TRIES = 4
+"""Files that are written for a quality; each is decoded and drawn."""
+
+
+def large_file(path: Path, device: torch.device) -> PlyBlocks | None:
+    """The rows of a .ply that is to be made small in two passes; None for any other file."""
+    name, most = path.name.lower(), LARGE[device.type]
+    if not name.endswith(".ply") or name.endswith(".compressed.ply") or not path.is_file():
+        return None
+    if path.stat().st_size < LEAST_ROW * most:  # not even its header is looked at
+        return None
+    found = blocks_of(path)
+    return found if found is not None and found.count > most else None
+
+
+@dataclass(frozen=True)
+class WrittenLarge:
+    """A file that was written, as `compressing` goes on with it."""
+
+    facts: dict[str, Any]
+    held_out: Pictures
+    seen: Views
+    plugins: PluginManager
+    device: torch.device
+    stages: Stages
+
+    def opened(self, path: Path, _: object) -> tuple[LargeScene, dict[str, Any]]:
+        """What the file decodes to, and the bytes of its sections, those of all tiles together."""
+        with self.stages.timed("decode"):
+            scene, reader = decoded(path, self.plugins, self.device)
+        sections: dict[str, int] = {"header": reader.header_bytes}
+        for name, size in reader.sections.items():
+            name = name.rpartition("/")[2]
+            sections[name] = sections.get(name, 0) + size
+        return scene, {"sections": sections}
+
+
+def decoded(path: Path, plugins: PluginManager, device: torch.device) -> tuple[LargeScene, ContainerReader]:
+    """The Gaussians of a file in tiles. Raises BitstreamError, OSError."""
+    reader = ContainerReader.open(path)
+    return LargeScene.of_tiles(tiles_of(reader, plugins, device), Shelf(path.parent)), reader
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is asked for."""
+
+    target: Target
+    given: Views | None
+    views: int | None
+    gaussians: int | None
+    sh_degree: int | None
+    drop_unseen: bool
+    device: torch.device
+    plugins: PluginManager
+    stages: Stages
+    say: Callable[[str], None]
+
+
+def write_large(blocks: PlyBlocks, asked: Asked, path: Path) -> WrittenLarge:
+    """Write the file. Raises UserInputError for a target out of reach, SceneError, BitstreamError, OSError."""
+    work = _Work(blocks, asked, path)
+    facts = work.for_size() if asked.target.size is not None else work.for_quality()
+    return WrittenLarge(facts, work.held_out, work.seen, asked.plugins, asked.device, asked.stages)
+
+
+class _Sample:
+    """Runs of a scene from everywhere, drawn among stand-ins of all else, and the search on them.
+
+    share   of the whole scene
+    """
+
+    def __init__(self, scene: LargeScene, seen: Views, rasterizer: Rasterizer, coder: Quantized, asked: Asked) -> None:
+        light = scene.light
+        rows = sample_rows(light.num_rows, SAMPLE, RUN).to(light.device)
+        self.share = len(rows) / light.num_rows
+        with asked.stages.timed("sample"):
+            among = Among(rasterizer, coarse(light, without(light.num_rows, rows)))
+            model = scene.part(rows)
+            options = RasterOptions(alpha=True)
+            self.judge = Pictures(model, seen.judge, among, options)
+            model = model if asked.sh_degree is None else with_degree(model, asked.sh_degree)
+            pruning = Pruning(model, seen.fit, among, keeps_unseen=keeps_unseen(asked))
+            setattr(model, IMPORTANCE, pruning.importance)
+        with asked.stages.timed("sensitivities"):
+            errors = Errors(coder, model, self.judge)
+        count = None if asked.gaussians is None else max(1, round(self.share * asked.gaussians))
+        self.reduction = Reduction(model, pruning, self.judge)
+        self.search = Search(coder, model, self.reduction, self.judge, errors, count)
+
+    def bytes_of(self, size: float) -> float:
+        """Of a part of a file of `size` bytes: what is fixed has each of them."""
+        return FIXED_BYTES + self.share * (size - FIXED_BYTES)
+
+    def tried(self) -> list[dict[str, Any]]:
+        """What was looked at, as figures of the whole."""
+        return [
+            {"gaussians": round(n / self.share), "bytes": round((b - FIXED_BYTES) / self.share + FIXED_BYTES),
+             "psnr": round(q + 10 * math.log10(self.share), 2)}
+            for n, b, q in self.search.tried
+        ]  # fmt: skip
+
+
+class _Unrounded:
+    """Quality of a part: its errors are too small for colours of 8 bits."""
+
+    def __init__(self, pictures: Pictures) -> None:
+        self._pictures = pictures
+
+    def quality(self, model: GaussianModel) -> _Unrounded:
+        self.psnr = decibels(self._pictures.error(model))
+        return self
+
+
+class _Work:
+    """The scene, its pictures, and the file on the way."""
+
+    def __init__(self, blocks: PlyBlocks, asked: Asked, path: Path) -> None:
+        self.asked, self.path, self.encodes = asked, path, 0
+        with asked.stages.timed("read"):
+            scene, read = read_scene(blocks, Shelf(path.parent), asked.device, blocks.path.name)
+        light = scene.light
+        self.coder = Quantized(asked.plugins, raster_of(light), precise=True)
+        rasterizer = NegotiatedRasterizer(asked.plugins, device=asked.device, options=raster_of(light))
+        with asked.stages.timed("cameras"), torch.no_grad():
+            self.seen = made_up_views(light, rasterizer, asked.views) if asked.given is None else asked.given
+            self.held_out = Pictures(scene, self.seen.held_out, rasterizer, RasterOptions(alpha=True))
+        self.sample = _Sample(scene, self.seen, rasterizer, self.coder, asked)
+        self._scene: LargeScene | None = scene
+        with asked.stages.timed("score"):
+            self._pruning = Pruning(light, self.seen.fit, rasterizer, keeps_unseen=keeps_unseen(asked))
+            unseen = int(self._pruning.unseen.sum())
+        self.facts: dict[str, Any] = {
+            "source": {"file": blocks.path.name, "bytes": blocks.path.stat().st_size, "gaussians": read},
+            "target": {"bytes": asked.target.size, "psnr": asked.target.quality},
+            "left_out": read - scene.num_rows, "unseen": unseen, "antialiased": antialias_of(light),
+            "tiles": len(scene.tiles), "refined": None,
+        }  # fmt: skip
+
+    def for_size(self) -> dict[str, Any]:
+        """Write the best file of the size."""
+        size, sample = self.asked.target.size, self.sample
+        assert size is not None  # it is asked for
+        with self.asked.stages.timed("search"):
+            choice = for_size(sample.search, sample.bytes_of(size)) or sample.search.coarsest
+        assert choice is not None  # a search looks at one part at least
+        file = self._reduced(choice)
+        best, most, held = choice, 0, None
+        for _ in range(MOST_ENCODES):
+            written, held = self._write(file, choice), choice
+            if most < written <= size:
+                best, most = choice, written
+            if LEAST_SHARE * size < written <= size or (written <= size and choice.is_finest):
+                break
+            # As far off as it is, so far the next one will be.
+            wanted = sample.bytes_of(AIM * size) * (choice.bytes / sample.bytes_of(written))
+            resized = choice.resized(wanted)
+            if resized is None or resized.allocation.levels == choice.allocation.levels:
+                resized = choice.coarsest() if written > size else None
+            if resized is None or resized.allocation.levels == choice.allocation.levels:
+                break
+            choice = resized
+        if not most:
+            raise too_small(size, f"{written:,}")
+        if held is not best:
+            self._write(file, best)
+        if most <= LEAST_SHARE * size:
+            what = "the finest settings give {:,} bytes, less than the target of {:,}"
+            told = what if best.is_finest else "{:,} bytes are the nearest to {:,} that was found"
+            self.asked.say(told.format(most, size))
+        return self._facts(best, most)
+
+    def for_quality(self) -> dict[str, Any]:
+        """Write the smallest file of the quality that a few tries find."""
+        quality, sample = self.asked.target.quality, self.sample
+        assert quality is not None  # it is asked for
+        with self.asked.stages.timed("search"):
+            exact: Any = _Unrounded(sample.judge)
+            choice = for_quality(sample.search, quality - 10 * math.log10(sample.share), exact)
+        file = self._reduced(choice)
+        best: tuple[int, Choice] | None = None
+        for _ in range(QUALITY_TRIES):
+            written = self._write(file, choice)
+            with self.asked.stages.timed("check"):
+                scene, _ = decoded(self.path, self.asked.plugins, self.asked.device)
+                reached = self.held_out.quality(scene).psnr
+                scene.shelf.close()
+            if reached >= quality and (best is None or written < best[0]):
+                best = written, choice
+            if quality <= reached <= quality + QUALITY_MARGIN or (reached < quality and choice.is_finest):
+                break
+            wanted = choice.allocation.error * 10 ** ((reached - quality - QUALITY_MARGIN / 2) / 10)
+            choice = replace(choice, allocation=of_error(choice.curves, wanted))
+        if best is None:
+            raise UserInputError(
+                f"the finest settings that were tried reach {reached:.1f} dB against the source, which is less than "
+                f"{quality:g} dB"
+            )
+        if best[1] is not choice:
+            self._write(file, best[1])
+        return self._facts(best[1], best[0])
+
+    def _facts(self, choice: Choice, written: int) -> dict[str, Any]:
+        levels = choice.allocation.levels
+        return {
+            **self.facts, "bytes": written, "encodes": self.encodes, "tried": self.sample.tried(),
+            "precision": self.coder.settings(levels).model_dump(exclude={"positions", "entropy"}),
+        }  # fmt: skip
+
+    def _write(self, file: TiledFile, choice: Choice) -> int:
+        self.encodes += 1
+        with self.asked.stages.timed("encode"):
+            return file.write(choice.allocation.levels, self.path)
+
+    def _reduced(self, choice: Choice) -> TiledFile:
+        """The whole scene with as small a share of its Gaussians as a choice has of the sample's; lets the scene go."""
+        scene, self._scene = self._scene, None
+        assert scene is not None  # it is done once
+        whole, searched = scene.num_rows, self.sample.search.model.num_rows
+        count = max(1, round(whole * choice.model.num_rows / searched))
+        if self.asked.gaussians is not None:
+            count = min(self.asked.gaussians, whole)
+        power = self.sample.reduction.power(choice.model.num_rows)
+        with self.asked.stages.timed("reduce"):
+            reduction = Reduction(scene.light, self._pruning)
+            rows = self._pruning.rows(reduction.kept(count, power) if count < whole else whole)
+            importance = list[Tensor]()
+            tiles = _reduced(scene, rows, min(count / len(rows), 1.0), power, reduction, importance, self.asked)
+            found = LargeScene.of_tiles(tiles, Shelf(self.path.parent))
+            self.facts |= {"pruned": whole - len(rows), "merged": len(rows) - found.num_rows}
+            scene.shelf.close()
+            del scene, self._pruning, reduction
+            return TiledFile(found, torch.cat(importance), self.coder, coders.OWN_BASIS)
+
+
+def keeps_unseen(asked: Asked) -> bool:
+    """Whether what no camera shows stays."""
+    return not asked.drop_unseen and asked.given is None and asked.gaussians is None
+
+
+def _reduced(
+    scene: LargeScene, rows: Tensor, share: float, power: float, reduction: Reduction, importance: list[Tensor],
+    asked: Asked,
+) -> Iterator[GaussianModel]:  # fmt: skip
+    """Tiles of the rows that stay, the share of them that is left when others have merged; fills `importance`."""
+    weights, known = reduction.weights(), reduction.pruning.importance
+    with track("reduce", total=len(scene.tiles), unit="tiles") as bar:
+        for tile in scene.tiles:
+            part = scene.rows(tile)
+            own = rows[(rows >= part.start) & (rows < part.stop)]
+            if not len(own):
+                continue
+            model = scene.tile(tile, own - part.start)
+            model = model if asked.sh_degree is None else with_degree(model, asked.sh_degree)
+            count, of = max(1, round(share * len(own))), known[own]
+            if count < len(own) and power < 1:
+                whole = torch.arange(len(own), device=own.device)
+                merged, of = merged_by(model, whole, count, weights[own])
+                model = like(model, merged)
+                drawn = model.opacity_logits >= FAINTEST
+                if not bool(drawn.all()):
+                    model, of = select(model, drawn), of[drawn]
+            importance.append(of)
+            yield model
+            bar.advance()

@@ -1,0 +1,192 @@
+"""A scene too large for memory: its higher spherical harmonics, most of it, lie in a file.
+
+What is left, 56 bytes of a Gaussian, is a model of SH degree 0 in Morton order, and is drawn, ranked and cut like any
+other. It is parted into tiles, runs of that order; a tile is whole in memory while something is done with it.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import torch
+from sw_gaussians.morton import morton_order
+from sw_gaussians.surfels import refuse_surfels
+from sw_reference.spherical_harmonics import sh_colors
+from torch import Tensor
+
+from splatwizard_core.api import SH, Camera, GaussianInputs, GaussianModel, SceneError
+from sw_compress.rows import like, select
+from sw_compress.shelf import Place, Shelf
+from sw_compress.source import FAINTEST
+
+if TYPE_CHECKING:
+    from splatwizard_core.api import Rasterizer
+
+TILE = 1 << 20
+"""Gaussians of a tile."""
+MOST_TILES = 64
+"""As many packets as a file can have; a larger scene has larger tiles."""
+ROWS_AT_ONCE = 1 << 16
+"""Rows whose colours are found together."""
+
+
+@dataclass
+class LargeScene:
+    """Gaussians in tiles.
+
+    light   all of them [N], SH degree 0 alone
+    degree  of what lies in the file
+    limits  first row of each tile, then N
+    """
+
+    light: GaussianModel
+    degree: int
+    limits: list[int]
+    shelf: Shelf
+    _rest: list[list[Place]]
+    _places: list[Tensor | None] = field(default_factory=list)
+
+    @property
+    def num_rows(self) -> int:
+        return self.light.num_rows
+
+    @property
+    def active_sh_degree(self) -> int:
+        return self.degree
+
+    @property
+    def device(self) -> torch.device:
+        return self.light.device
+
+    @property
+    def tiles(self) -> range:
+        """Numbers of the tiles."""
+        return range(len(self.limits) - 1)
+
+    def rows(self, tile: int) -> slice:
+        """Rows of a tile."""
+        return slice(self.limits[tile], self.limits[tile + 1])
+
+    def rest(self, tile: int) -> Tensor:
+        """Higher SH coefficients [n,K-1,3] of a tile."""
+        count, width = self.limits[tile + 1] - self.limits[tile], (self.degree + 1) ** 2 - 1
+        if not width:
+            return self.light.means.new_zeros(count, 0, 3)
+        found = torch.cat([self.shelf.get(place) for place in self._rest[tile]])
+        places = self._places[tile] if self._places else None
+        return (found if places is None else found[places]).to(self.device)
+
+    def tile(self, tile: int, rows: Tensor | None = None) -> GaussianModel:
+        """The Gaussians of a tile, or some of its rows."""
+        rest, part = self.rest(tile), self.rows(tile)
+        some = torch.arange(part.start, part.stop, device=self.device) if rows is None else part.start + rows
+        raw = {name: getattr(self.light, name).detach()[some] for name in self.light.RAW}
+        raw["sh_rest"] = rest if rows is None else rest[rows]
+        return like(self.light, GaussianModel(**raw))
+
+    def part(self, rows: Tensor) -> GaussianModel:
+        """The Gaussians of an index [M], ascending."""
+        found = []
+        for tile in self.tiles:
+            part = self.rows(tile)
+            some = rows[(rows >= part.start) & (rows < part.stop)] - part.start
+            if len(some):
+                found.append(self.tile(tile, some))
+        return joined(found, self.light)
+
+    @torch.no_grad()
+    def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
+        """All Gaussians in their colours as the camera sees them."""
+        light, colors = self.light, torch.empty_like(self.light.means)
+        for tile in self.tiles:
+            rest, start = self.rest(tile), self.limits[tile]
+            for first in range(0, len(rest), ROWS_AT_ONCE):
+                rows = slice(start + first, start + min(first + ROWS_AT_ONCE, len(rest)))
+                sh = SH(dc=light.sh_dc[rows], rest=rest[first : first + ROWS_AT_ONCE], active_degree=self.degree)
+                if not self.degree:
+                    sh.rest = None
+                colors[rows] = sh_colors(sh, camera.center.to(light.means), light.means[rows])
+        return GaussianInputs(light.means, light.opacities, light.scales, light.quats, colors=colors)
+
+    @classmethod
+    def of_tiles(cls, tiles: Iterable[GaussianModel], shelf: Shelf) -> LargeScene:
+        """A scene of what is known tile by tile."""
+        lights, places, limits = [], [], [0]
+        degree = 0
+        for tile in tiles:
+            degree = tile.active_sh_degree
+            lights.append(_light(tile))
+            places.append([shelf.put(tile.sh_rest)])
+            limits.append(limits[-1] + tile.num_rows)
+        return cls(joined(lights, lights[0]), degree, limits, shelf, places)
+
+
+def read_scene(
+    blocks: Iterable[GaussianModel], shelf: Shelf, device: torch.device, name: str
+) -> tuple[LargeScene, int]:
+    """Read a scene, without what can never be drawn; and how many Gaussians mean something.
+
+    blocks      rows of a file, which are read twice
+    name        for messages
+
+    Raises SceneError where nothing can be seen, UserInputError for surfels.
+    """
+    lights, read, degree = list[GaussianModel](), 0, 0
+    for block in blocks:
+        refuse_surfels(block, f"{name}: `sw compress`")
+        read, degree = read + block.num_rows, block.active_sh_degree
+        lights.append(_light(_drawn(block)))
+    if not sum(each.num_rows for each in lights):
+        raise SceneError(f"{name}: holds no Gaussian that could be seen")
+    light = joined(lights, lights[0])
+    order = morton_order(light.means.detach())
+    light = select(light, order)
+    count = light.num_rows
+    size = max(TILE, -(-count // MOST_TILES))
+    limits = [*range(0, count, size), count]
+    # A tile's rows come in the order of the file; where each of them goes follows from the order of all.
+    tile_of = torch.empty(count, dtype=torch.uint8)
+    tile_of[order] = (torch.arange(count) // size).to(torch.uint8)
+    places = list[Tensor]()
+    for start, end in itertools.pairwise(limits):
+        places.append(torch.argsort(torch.argsort(order[start:end])).int())
+    del order
+    rest: list[list[Place]] = [[] for _ in places]
+    if degree:
+        at = 0
+        for block in blocks:
+            part = _drawn(block).sh_rest.detach()
+            of = tile_of[at : at + len(part)]
+            at += len(part)
+            for tile in of.unique().tolist():
+                rest[tile].append(shelf.put(part[of == tile]))
+    return LargeScene(light.to(device), degree, limits, shelf, rest, list(places)), read
+
+
+def joined(parts: Sequence[GaussianModel], told: GaussianModel) -> GaussianModel:
+    """One model of several, which are emptied on the way: of none two whole copies are in memory.
+
+    told    has what the file told
+    """
+    raw = {}
+    for name in told.RAW:
+        raw[name] = torch.cat([getattr(each, name).detach() for each in parts])
+        for each in parts:
+            if each is not told:
+                setattr(each, name, torch.nn.Parameter(raw[name][:0], requires_grad=False))
+    return like(told, GaussianModel(**raw))
+
+
+def _drawn(model: GaussianModel) -> GaussianModel:
+    drawn = model.opacities >= FAINTEST
+    return model.eval().requires_grad_(False) if bool(drawn.all()) else select(model, drawn)
+
+
+def _light(model: GaussianModel) -> GaussianModel:
+    """The same without higher SH coefficients."""
+    raw = {name: getattr(model, name).detach() for name in model.RAW}
+    raw["sh_rest"] = raw["sh_rest"].new_zeros(model.num_rows, 0, 3)
+    return like(model, GaussianModel(**raw))
