@@ -34,7 +34,7 @@ from sw_compress.pruning import Pruning
 from sw_compress.quality import Pictures, decibels
 from sw_compress.reducing import Reduction
 from sw_compress.rows import IMPORTANCE, like, select, with_degree
-from sw_compress.search import Choice, Search, for_quality, for_size, too_small
+from sw_compress.search import Choice, Search, for_quality, for_size, least_bytes, too_small
 from sw_compress.shelf import Shelf
 from sw_compress.targets import LEAST_SHARE, QUALITY_MARGIN, Target
 from sw_compress.tiled_file import TiledFile, tiles_of
@@ -134,22 +134,30 @@ class _Sample:
             options = RasterOptions(alpha=True)
             self.judge = Pictures(model, seen.judge, among, options)
             model = model if asked.sh_degree is None else with_degree(model, asked.sh_degree)
+            count = None if asked.gaussians is None else max(1, round(self.share * asked.gaussians))
+            if (size := asked.target.size) is not None and (
+                least := self.whole_bytes(least_bytes(coder, model, count))
+            ) > 2 * size:
+                raise too_small(size, f"about {least:,.0f}")
             pruning = Pruning(model, seen.fit, among, keeps_unseen=keeps_unseen(asked))
             setattr(model, IMPORTANCE, pruning.importance)
         with asked.stages.timed("sensitivities"):
             errors = Errors(coder, model, self.judge)
-        count = None if asked.gaussians is None else max(1, round(self.share * asked.gaussians))
         self.reduction = Reduction(model, pruning, self.judge)
         self.search = Search(coder, model, self.reduction, self.judge, errors, count)
 
     def bytes_of(self, size: float) -> float:
-        """Of a part of a file of `size` bytes: what is fixed has each of them."""
+        """The sample's part of a file of `size` bytes: what is fixed has each of them."""
         return FIXED_BYTES + self.share * (size - FIXED_BYTES)
+
+    def whole_bytes(self, size: float) -> float:
+        """The file whose part has `size` bytes."""
+        return FIXED_BYTES + (size - FIXED_BYTES) / self.share
 
     def tried(self) -> list[dict[str, Any]]:
         """What was looked at, as figures of the whole."""
         return [
-            {"gaussians": round(n / self.share), "bytes": round((b - FIXED_BYTES) / self.share + FIXED_BYTES),
+            {"gaussians": round(n / self.share), "bytes": round(self.whole_bytes(b)),
              "psnr": round(q + 10 * math.log10(self.share), 2)}
             for n, b, q in self.search.tried
         ]  # fmt: skip

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
@@ -47,7 +47,7 @@ class LargeScene:
     limits: list[int]
     shelf: Shelf
     _rest: list[list[Place]]
-    _places: list[Tensor | None] = field(default_factory=list)
+    _goes_to: list[Tensor | None]
 
     @property
     def num_rows(self) -> int:
@@ -75,9 +75,14 @@ class LargeScene:
         count, width = self.limits[tile + 1] - self.limits[tile], (self.degree + 1) ** 2 - 1
         if not width:
             return self.light.means.new_zeros(count, 0, 3)
-        found = torch.cat([self.shelf.get(place) for place in self._rest[tile]])
-        places = self._places[tile] if self._places else None
-        return (found if places is None else found[places]).to(self.device)
+        found, goes_to = torch.empty(count, width, 3), self._goes_to[tile]
+        at = 0
+        for place in self._rest[tile]:
+            part = self.shelf.get(place)
+            here = slice(at, at + len(part))
+            found[here if goes_to is None else goes_to[here].long()] = part
+            at += len(part)
+        return found.to(self.device)
 
     def tile(self, tile: int, rows: Tensor | None = None) -> GaussianModel:
         """The Gaussians of a tile, or some of its rows."""
@@ -121,7 +126,7 @@ class LargeScene:
             lights.append(_light(tile))
             places.append([shelf.put(tile.sh_rest)])
             limits.append(limits[-1] + tile.num_rows)
-        return cls(joined(lights, lights[0]), degree, limits, shelf, places)
+        return cls(joined(lights, lights[0]), degree, limits, shelf, places, [None] * len(places))
 
 
 def read_scene(
@@ -147,14 +152,12 @@ def read_scene(
     count = light.num_rows
     size = max(TILE, -(-count // MOST_TILES))
     limits = [*range(0, count, size), count]
-    # A tile's rows come in the order of the file; where each of them goes follows from the order of all.
     tile_of = torch.empty(count, dtype=torch.uint8)
     tile_of[order] = (torch.arange(count) // size).to(torch.uint8)
-    places = list[Tensor]()
-    for start, end in itertools.pairwise(limits):
-        places.append(torch.argsort(torch.argsort(order[start:end])).int())
+    # A tile's rows come in the order of the file.
+    goes_to = [torch.argsort(order[start:end]).int() for start, end in itertools.pairwise(limits)]
     del order
-    rest: list[list[Place]] = [[] for _ in places]
+    rest: list[list[Place]] = [[] for _ in goes_to]
     if degree:
         at = 0
         for block in blocks:
@@ -163,7 +166,7 @@ def read_scene(
             at += len(part)
             for tile in of.unique().tolist():
                 rest[tile].append(shelf.put(part[of == tile]))
-    return LargeScene(light.to(device), degree, limits, shelf, rest, list(places)), read
+    return LargeScene(light.to(device), degree, limits, shelf, rest, list(goes_to)), read
 
 
 def joined(parts: Sequence[GaussianModel], told: GaussianModel) -> GaussianModel:

@@ -172,18 +172,21 @@ def _looked_at(search: Search, count: int, budget: float) -> tuple[Choice | None
 
 
 def check_in_reach(coder: Quantized, model: GaussianModel, count: int | None, size: int) -> None:
-    """Raise UserInputError for less than half of the estimate of the fewest Gaussians as coarse as can be.
+    """Raise UserInputError for less than half of `least_bytes`: no part that is worth more has so few."""
+    least = least_bytes(coder, model, count)
+    if least > 2 * size:
+        raise too_small(size, f"about {least:,.0f}")
+
+
+def least_bytes(coder: Quantized, model: GaussianModel, count: int | None) -> float:
+    """Estimate the file of the fewest Gaussians as coarse as can be, evenly taken instead of the best.
 
     count   of Gaussians that stay; None: what is best
-
-    They are evenly taken instead of the best, and no part that is worth more has half of their bytes.
     """
     count = parts_of(model.num_rows, count)[-1]
     few = torch.arange(0, model.num_rows, max(1, model.num_rows // count))
     part = select(model, few.to(model.device)[:count])
-    least = FIXED_BYTES + sum(float(each[-1]) for each in coder.sizes(part, coarsest=True).values())
-    if least > 2 * size:
-        raise too_small(size, f"about {least:,.0f}")
+    return FIXED_BYTES + sum(float(each[-1]) for each in coder.sizes(part, coarsest=True).values())
 
 
 def too_small(size: int, smallest: str) -> UserInputError:

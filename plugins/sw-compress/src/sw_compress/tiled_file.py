@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from sw_gaussians.rows import select
 
 from splatwizard_core.api import ContainerReader, ContainerWriter, GaussianModel
 from splatwizard_core.tooling import filled_writer
-from sw_3dgs.config import MODES
 from sw_codecs.models import precision, sh_basis
 from sw_codecs.models.attributes import Ready, Values
 from sw_codecs.models.band_context import suitable_classes
@@ -43,8 +43,6 @@ if TYPE_CHECKING:
     from splatwizard_core.api import Method, PluginManager
     from sw_codecs.models.settings import QuantizedSettings
     from sw_compress.large_scene import LargeScene
-
-CODEC = "gaussians-quantized"
 
 
 class _WholeBasis(sh_basis.Basis):
@@ -147,8 +145,9 @@ class _ByTiles:
         return self.method.plugins
 
     def encode(self, model: GaussianModel, writer: ContainerWriter) -> None:
-        self.plugins.gaussian_codecs.load(CODEC)  # recorded, as if it had done it
-        writer.static["mode"] = next(mode for mode, name in MODES.items() if name == CODEC)
+        one = ContainerWriter(self.name, self.version)
+        self.method.encode(select(model, torch.arange(1, device=model.device)), one)
+        writer.static |= {key: value for key, value in one.static.items() if key not in Layout.model_fields}
         self.file.fill(writer, self.settings, self.plugins)
 
 
