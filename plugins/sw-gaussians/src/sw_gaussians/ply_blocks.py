@@ -11,8 +11,8 @@ from splatwizard_core.api import GaussianModel, SplatwizardError
 from sw_gaussians.ply import from_ply
 from sw_gaussians.ply_tables import MAX_HEADER, read_header
 
-ROWS_AT_ONCE = 1 << 17
-"""Rows of a block: 33 MB at SH degree 3."""
+ROWS_AT_ONCE = 1 << 15
+"""Rows of a block: 8 MB at SH degree 3."""
 
 
 @dataclass(frozen=True)
