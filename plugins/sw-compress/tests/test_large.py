@@ -8,14 +8,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from sw_compress import Compressed, compress, large, large_scene
+from sw_compress import Compressed, compress, large, large_scene, ply_blocks
 from sw_compress.among import Among, coarse, sample_rows, without
 from sw_compress.large_scene import LargeScene, read_scene
+from sw_compress.ply_blocks import blocks_of
 from sw_compress.shelf import Shelf
 from sw_compress.source import FAINTEST
 from sw_compress.stages import Stages
-from sw_gaussians import ply_blocks
-from sw_gaussians.ply_blocks import blocks_of
 from sw_gaussians.rows import select
 
 from splatwizard_core.api import Camera, GaussianModel, RasterOptions, UserInputError

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from sw_gaussians.ply_blocks import PlyBlocks, blocks_of
 from sw_gaussians.render_options import antialias_of, raster_of
 from sw_gaussians.simplifying import merged_by
 from torch import Tensor
@@ -30,6 +29,7 @@ from sw_compress.coders import FIXED_BYTES, Quantized
 from sw_compress.filling import AIM, MOST_ENCODES
 from sw_compress.large_scene import LargeScene, read_scene
 from sw_compress.measuring import Errors
+from sw_compress.ply_blocks import PlyBlocks, blocks_of
 from sw_compress.pruning import Pruning
 from sw_compress.quality import Pictures, decibels
 from sw_compress.reducing import Reduction
@@ -79,7 +79,7 @@ class WrittenLarge:
     stages: Stages
 
     def opened(self, path: Path, _: object) -> tuple[LargeScene, dict[str, Any]]:
-        """What the file decodes to, and the bytes of its sections, those of all tiles together."""
+        """Decode the file; return that, and the bytes of its sections, those of all tiles together."""
         with self.stages.timed("decode"):
             scene, reader = decoded(path, self.plugins, self.device)
         sections: dict[str, int] = {"header": reader.header_bytes}
@@ -97,7 +97,7 @@ def decoded(path: Path, plugins: PluginManager, device: torch.device) -> tuple[L
 
 @dataclass(frozen=True)
 class Asked:
-    """What is asked for."""
+    """Target and bounds of one file."""
 
     target: Target
     given: Views | None
@@ -155,7 +155,7 @@ class _Sample:
         return FIXED_BYTES + (size - FIXED_BYTES) / self.share
 
     def tried(self) -> list[dict[str, Any]]:
-        """What was looked at, as figures of the whole."""
+        """Numbers that were looked at, as figures of the whole."""
         return [
             {"gaussians": round(n / self.share), "bytes": round(self.whole_bytes(b)),
              "psnr": round(q + 10 * math.log10(self.share), 2)}

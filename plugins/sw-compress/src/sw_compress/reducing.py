@@ -77,7 +77,7 @@ class Reduction:
         return self._chosen[min(more)] if more else 0
 
     def kept(self, count: int, power: float) -> int:
-        """How many removals leave; the rest of what is too many merges."""
+        """Count those that removals leave; the rest of what is too many merges."""
         whole = self.model.num_rows
         return max(count, round(whole * (count / whole) ** power))
 

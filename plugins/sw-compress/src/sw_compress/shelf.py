@@ -13,7 +13,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Place:
-    """Where numbers lie."""
+    """Start and shape of numbers on a shelf."""
 
     start: int
     shape: tuple[int, ...]

@@ -53,7 +53,7 @@ class _WholeBasis(sh_basis.Basis):
 
 
 class TiledFile:
-    """What all tiles of a file share, and its writer.
+    """Writer of a file, with what all its tiles share.
 
     scene       what is written
     importance  what each of its Gaussians weighs in pictures [N]

@@ -7,9 +7,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatwizard_core.api import GaussianModel, SplatwizardError
 from sw_gaussians.ply import from_ply
 from sw_gaussians.ply_tables import MAX_HEADER, read_header
+
+from splatwizard_core.api import GaussianModel, SplatwizardError
 
 ROWS_AT_ONCE = 1 << 15
 """Rows of a block: 8 MB at SH degree 3."""
