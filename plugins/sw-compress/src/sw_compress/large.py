@@ -8,6 +8,7 @@ whole. The second pass reduces and writes tile by tile.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -113,8 +114,9 @@ class Asked:
 
 def write_large(blocks: PlyBlocks, asked: Asked, path: Path) -> WrittenLarge:
     """Write the file. Raises UserInputError for a target out of reach, SceneError, BitstreamError, OSError."""
-    work = _Work(blocks, asked, path)
-    facts = work.for_size() if asked.target.size is not None else work.for_quality()
+    with contextlib.ExitStack() as shelves:
+        work = _Work(blocks, asked, path, shelves)
+        facts = work.for_size() if asked.target.size is not None else work.for_quality()
     return WrittenLarge(facts, work.held_out, work.seen, asked.plugins, asked.device, asked.stages)
 
 
@@ -175,12 +177,15 @@ class _Unrounded:
 
 
 class _Work:
-    """The scene, its pictures, and the file on the way."""
+    """The scene, its pictures, and the file on the way.
 
-    def __init__(self, blocks: PlyBlocks, asked: Asked, path: Path) -> None:
-        self.asked, self.path, self.encodes = asked, path, 0
+    shelves     closes what lies beside the file
+    """
+
+    def __init__(self, blocks: PlyBlocks, asked: Asked, path: Path, shelves: contextlib.ExitStack) -> None:
+        self.asked, self.path, self.shelves, self.encodes = asked, path, shelves, 0
         with asked.stages.timed("read"):
-            scene, read = read_scene(blocks, Shelf(path.parent), asked.device, blocks.path.name)
+            scene, read = read_scene(blocks, self._shelf(), asked.device, blocks.path.name)
         light = scene.light
         self.coder = Quantized(asked.plugins, raster_of(light), precise=True)
         rasterizer = NegotiatedRasterizer(asked.plugins, device=asked.device, options=raster_of(light))
@@ -198,6 +203,11 @@ class _Work:
             "left_out": read - scene.num_rows, "unseen": unseen, "antialiased": antialias_of(light),
             "tiles": len(scene.tiles), "refined": None,
         }  # fmt: skip
+
+    def _shelf(self) -> Shelf:
+        shelf = Shelf(self.path.parent)
+        self.shelves.callback(shelf.close)
+        return shelf
 
     def for_size(self) -> dict[str, Any]:
         """Write the best file of the size."""
@@ -241,6 +251,7 @@ class _Work:
             choice = for_quality(sample.search, quality - 10 * math.log10(sample.share), exact)
         file = self._reduced(choice)
         best: tuple[int, Choice] | None = None
+        known: list[tuple[float, float]] = []  # decibels by the tables, and in pictures
         for _ in range(QUALITY_TRIES):
             written = self._write(file, choice)
             with self.asked.stages.timed("check"):
@@ -251,8 +262,12 @@ class _Work:
                 best = written, choice
             if quality <= reached <= quality + QUALITY_MARGIN or (reached < quality and choice.is_finest):
                 break
-            wanted = choice.allocation.error * 10 ** ((reached - quality - QUALITY_MARGIN / 2) / 10)
-            choice = replace(choice, allocation=of_error(choice.curves, wanted))
+            known.append((decibels(choice.allocation.error), reached))
+            slope = 1.0  # part of the error may be of what is gone, which no precision mends
+            if len(known) > 1 and known[-1][0] != known[-2][0]:
+                slope = min(max((known[-1][1] - known[-2][1]) / (known[-1][0] - known[-2][0]), 0.25), 2.0)
+            wanted = known[-1][0] + (quality + QUALITY_MARGIN / 2 - reached) / slope
+            choice = replace(choice, allocation=of_error(choice.curves, 10 ** (-wanted / 10)))
         if best is None:
             raise UserInputError(
                 f"the finest settings that were tried reach {reached:.1f} dB against the source, which is less than "
@@ -288,7 +303,7 @@ class _Work:
             rows = self._pruning.rows(reduction.kept(count, power) if count < whole else whole)
             importance = list[Tensor]()
             tiles = _reduced(scene, rows, min(count / len(rows), 1.0), power, reduction, importance, self.asked)
-            found = LargeScene.of_tiles(tiles, Shelf(self.path.parent))
+            found = LargeScene.of_tiles(tiles, self._shelf())
             self.facts |= {"pruned": whole - len(rows), "merged": len(rows) - found.num_rows}
             scene.shelf.close()
             del scene, self._pruning, reduction
