@@ -1,6 +1,7 @@
 """Memory and seconds of `sw compress` for a file of millions of Gaussians, made for this and deleted again.
 
     python benchmarks/large_file.py --gaussians 8600000 --size 60MB --folder /tmp [--limit N] [--json FILE]
+    python benchmarks/large_file.py --ply garden.ply --size 60MB        # a file that is there
 
 The Gaussians are those of `scene.py`, some scenes over each other, with scales as of one of so many. With --limit
 two passes begin at so many, whatever the usual number is. Beside the file of 248 bytes a Gaussian the folder needs room
@@ -71,6 +72,7 @@ def main() -> None:
     parser.add_argument("--gaussians", type=int, default=8_600_000)
     parser.add_argument("--size", default="60MB")
     parser.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir()))
+    parser.add_argument("--ply", type=Path, help="in place of one that is made")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--limit", type=int, help="Gaussians above which there are two passes")
     parser.add_argument("--json", type=Path)
@@ -81,14 +83,15 @@ def main() -> None:
     Stages.timed_alone = Stages.timed  # type: ignore[attr-defined]
     Stages.timed = lambda stages, name: watched.timed(stages, name)  # type: ignore[method-assign]
     with tempfile.TemporaryDirectory(dir=chosen.folder) as folder:
-        path = Path(folder) / "scene.ply"
-        write_scene(path, chosen.gaussians)
+        path = chosen.ply or Path(folder) / "scene.ply"
+        if chosen.ply is None:
+            write_scene(path, chosen.gaussians)
         began, cpu = time.perf_counter(), time.process_time()
-        done = compress(path, size=chosen.size, device=chosen.device, out=path.with_suffix(".swz"), say=print)
+        done = compress(path, size=chosen.size, device=chosen.device, out=Path(folder) / "scene.swz", say=print)
         record = done.record
         found = {
-            "gaussians": chosen.gaussians, "bytes_before": path.stat().st_size,
-            **{key: record.get(key) for key in ("bytes", "pruned", "merged", "encodes", "tiles", "quality", "tried")},
+            "gaussians": record["source"]["gaussians"], "bytes_before": path.stat().st_size,
+            **{key: record.get(key) for key in ("bytes", "pruned", "merged", "encodes", "tiles", "quality", "tried", "peak_bytes")},
             "left": record["gaussians"], "seconds": time.perf_counter() - began, "cpu": time.process_time() - cpu,
             "most": max(row["most"] for row in watched.stages), "stages": watched.stages,
         }  # fmt: skip
