@@ -29,6 +29,8 @@ from sw_gaussians.ply_gaussians import file_parts
 from splatwizard_core.tooling import peak_rss_bytes, reset_peak_rss, rss_bytes
 
 ROWS_AT_ONCE = 1 << 18
+KEPT = ("bytes", "pruned", "merged", "encodes", "tiles", "quality", "tried", "peak_bytes")
+"""Of the record of `sw compress`."""
 
 
 def write_scene(path: Path, count: int) -> None:
@@ -91,7 +93,7 @@ def main() -> None:
         record = done.record
         found = {
             "gaussians": record["source"]["gaussians"], "bytes_before": path.stat().st_size,
-            **{key: record.get(key) for key in ("bytes", "pruned", "merged", "encodes", "tiles", "quality", "tried", "peak_bytes")},
+            **{key: record.get(key) for key in KEPT},
             "left": record["gaussians"], "seconds": time.perf_counter() - began, "cpu": time.process_time() - cpu,
             "most": max(row["most"] for row in watched.stages), "stages": watched.stages,
         }  # fmt: skip
