@@ -139,6 +139,14 @@ def test_blocks_are_the_rows_of_the_file(source):
         assert torch.equal(torch.cat([getattr(each, name) for each in blocks]), getattr(whole, name))
 
 
+def test_rows_that_mean_nothing_are_left_out(tmp_path, ball):
+    model = ball(1_000, degree=0)
+    model.means[3:403] = torch.nan  # all of a block, and more
+    model.quats[700] = 0
+    export_model(model, tmp_path / "a.ply", load_plugins())
+    assert sum(each.num_rows for each in blocks_of(tmp_path / "a.ply")) == 599
+
+
 def test_text_and_rows_after_others_are_no_blocks(tmp_path):
     path, rows = tmp_path / "a.ply", "property float x\nend_header\n"
     for head in (

@@ -186,6 +186,8 @@ class _Work:
         self.asked, self.path, self.shelves, self.encodes = asked, path, shelves, 0
         with asked.stages.timed("read"):
             scene, read = read_scene(blocks, self._shelf(), asked.device, blocks.path.name)
+        if read < blocks.count:
+            asked.say(f"{blocks.path.name}: {blocks.count - read:,} Gaussians mean nothing and were left out")
         light = scene.light
         self.coder = Quantized(asked.plugins, raster_of(light), precise=True)
         rasterizer = NegotiatedRasterizer(asked.plugins, device=asked.device, options=raster_of(light))
