@@ -5,6 +5,8 @@ const COPY_FRAGMENT = `#version 300 es
 precision highp float; uniform sampler2D frame; uniform vec2 size; out vec4 drawn;
 void main() { drawn = vec4(texture(frame, gl_FragCoord.xy / size).rgb, 1); }`;
 
+const QUADS = 1024;  // Gaussians of an instance: one each costs a software renderer more than the drawing itself
+
 class Renderer {
   constructor(canvas, gaussians, facts, sources, keep) {
     const gl = canvas.getContext('webgl2', { alpha: false, antialias: false, depth: false, preserveDrawingBuffer: keep });
@@ -14,22 +16,19 @@ class Renderer {
     this.splats = this.program(sources.vertex, sources.fragment);
     this.copy = this.program(COPY_VERTEX, COPY_FRAGMENT);
     this.textures = [];
-    this.rows = gl.createBuffer();
     this.quads = gl.createVertexArray();
     this.nothing = gl.createVertexArray();
     gl.bindVertexArray(this.quads);
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.rows);
-    const row = gl.getAttribLocation(this.splats.program, 'row');
-    gl.enableVertexAttribArray(row);
-    gl.vertexAttribIPointer(row, 1, gl.UNSIGNED_INT, 0, 0);
-    gl.vertexAttribDivisor(row, 1);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    const corners = Uint16Array.from({ length: 6 * QUADS }, (_, i) => 4 * Math.floor(i / 6) + [0, 1, 2, 2, 1, 3][i % 6]);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
     this.put(gaussians);
     this.size = [0, 0];
   }
 
   put(gaussians) {
-    this.texture(0, gaussians.words);
-    this.texture(1, gaussians.harmonics);
+    this.texture(0, gaussians.words, 4);
+    this.texture(1, gaussians.harmonics, 4);
     this.constants(gaussians);
   }
 
@@ -54,16 +53,17 @@ class Renderer {
     return { program, at };
   }
 
-  texture(unit, words) {
-    const gl = this.gl, texels = Math.max(1, Math.ceil(words.length / 4));
+  texture(unit, words, channels) {  // four channels or one
+    const gl = this.gl, texels = Math.max(1, Math.ceil(words.length / channels));
     const most = gl.getParameter(gl.MAX_TEXTURE_SIZE), width = Math.min(most, 2048), height = Math.ceil(texels / width);
     if (height > most) throw new Error('The GPU of this browser has no texture that is large enough for this scene.');
-    const padded = new Uint32Array(4 * width * height);
+    const padded = new Uint32Array(channels * width * height);
     padded.set(words);
     gl.activeTexture(gl.TEXTURE0 + unit);
     gl.deleteTexture(this.textures[unit] ?? null);
     gl.bindTexture(gl.TEXTURE_2D, this.textures[unit] = gl.createTexture());
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32UI, width, height, 0, gl.RGBA_INTEGER, gl.UNSIGNED_INT, padded);
+    const [kind, format] = channels === 1 ? [gl.R32UI, gl.RED_INTEGER] : [gl.RGBA32UI, gl.RGBA_INTEGER];
+    gl.texImage2D(gl.TEXTURE_2D, 0, kind, width, height, 0, format, gl.UNSIGNED_INT, padded);
     for (const key of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, key, gl.NEAREST);
   }
 
@@ -72,6 +72,7 @@ class Renderer {
     gl.useProgram(program);
     gl.uniform1i(at.gaussians, 0);
     gl.uniform1i(at.harmonics, 1);
+    gl.uniform1i(at.order, 3);
     gl.uniform1i(at.degree, facts.degree);
     gl.uniform1i(at.harmonicTexels, texels);
     gl.uniform1f(at.lowPass, facts.eps2d);
@@ -82,9 +83,7 @@ class Renderer {
   }
 
   take(sorted) {
-    const gl = this.gl;
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.rows);
-    gl.bufferData(gl.ARRAY_BUFFER, sorted, gl.DYNAMIC_DRAW);
+    this.texture(3, sorted, 1);
     this.count = sorted.length;
   }
 
@@ -127,7 +126,8 @@ class Renderer {
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.bindVertexArray(this.quads);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.count);
+    gl.uniform1i(at.count, this.count);
+    gl.drawElementsInstanced(gl.TRIANGLES, 6 * QUADS, gl.UNSIGNED_SHORT, 0, Math.ceil(this.count / QUADS));
     if (!this.blendsHalf) return;
     gl.disable(gl.BLEND);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);

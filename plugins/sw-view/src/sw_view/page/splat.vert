@@ -5,11 +5,10 @@ precision highp float;
 precision highp int;
 precision highp usampler2D;
 
-in uint row;
-
 uniform usampler2D gaussians;   // two texels a Gaussian: mean (3 floats), scales; rotation, colour, opacity
 uniform usampler2D harmonics;   // bytes of the bands above 0, four a word
-uniform int degree, harmonicTexels;
+uniform usampler2D order;       // rows of Gaussians, the farthest first
+uniform int count, degree, harmonicTexels;
 uniform mat3 rotation;          // world -> camera
 uniform vec3 translation, eye;
 uniform vec2 focal, principal, viewport;  // pixels of the frame
@@ -24,13 +23,16 @@ out vec2 sigmas;                // place in the ellipse, in standard deviations 
 
 const float LIMIT = 1.0 / 255.0;
 
+const int CORNERS = 4096;       // of an instance, four a Gaussian
+int row;
+
 uvec4 texel(usampler2D source, int index) {
   int width = textureSize(source, 0).x;
   return texelFetch(source, ivec2(index % width, index / width), 0);
 }
 
 float byteOf(int index) {       // one coefficient, -128..127
-  uvec4 words = texel(harmonics, int(row) * harmonicTexels + index / 16);
+  uvec4 words = texel(harmonics, row * harmonicTexels + index / 16);
   return float(int((words[(index / 4) % 4] >> uint(8 * (index % 4))) & 255u) - 128);
 }
 
@@ -73,7 +75,10 @@ mat3 axesOf(uint word) {        // the largest of w, x, y, z is left out: its in
 
 void main() {
   gl_Position = vec4(0.0, 0.0, 2.0, 1.0);  // outside: nothing is drawn
-  uvec4 first = texel(gaussians, 2 * int(row)), second = texel(gaussians, 2 * int(row) + 1);
+  int place = (CORNERS * gl_InstanceID + gl_VertexID) / 4;
+  if (place >= count) return;
+  row = int(texel(order, place).x);
+  uvec4 first = texel(gaussians, 2 * row), second = texel(gaussians, 2 * row + 1);
   vec3 mean = uintBitsToFloat(first.xyz);
   vec3 t = rotation * mean + translation;
   if (t.z <= nearest) return;
@@ -96,14 +101,14 @@ void main() {
   float larger = middle + gap, smaller = area / larger;
   vec2 axis = gap < 1e-9 * middle ? vec2(1, 0)
       : a > c ? normalize(vec2(larger - c, b)) : normalize(vec2(b, larger - a));
-  sigmas = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0;
+  sigmas = vec2(gl_VertexID & 1, gl_VertexID >> 1 & 1) * 2.0 - 1.0;
   sigmas *= sqrt(2.0 * log(255.0 * opacity));  // where alpha falls to 1/255
-  vec2 place = focal * t.xy / t.z + principal;
-  place += sigmas.x * sqrt(larger) * axis + sigmas.y * sqrt(smaller) * vec2(-axis.y, axis.x);
+  vec2 centre = focal * t.xy / t.z + principal;
+  centre += sigmas.x * sqrt(larger) * axis + sigmas.y * sqrt(smaller) * vec2(-axis.y, axis.x);
 
   vec3 rgb = colorRange.x + colorRange.y * vec3(uvec3(second.y, second.y >> 11u, second.y >> 22u)
       & uvec3(2047u, 2047u, 1023u)) * vec3(1.0, 1.0, 2047.0 / 1023.0);
   if (degree > 0) rgb += colorFrom(normalize(mean - eye));
   color = vec4(max(rgb, 0.0), opacity);
-  gl_Position = vec4(2.0 * place.x / viewport.x - 1.0, 1.0 - 2.0 * place.y / viewport.y, 0.0, 1.0);
+  gl_Position = vec4(2.0 * centre.x / viewport.x - 1.0, 1.0 - 2.0 * centre.y / viewport.y, 0.0, 1.0);
 }
