@@ -122,12 +122,106 @@ void put_shape(const float* shape, double size, double thinnest, double thickest
   put_quaternion(sorted, quat);
 }
 
-Buffer<float> floats(const EightBitLayer& layer) {
-  Buffer<float> found(layer.outputs * layer.inputs);
-  for (int64_t i = 0; i < found.size; ++i)
-    found[i] = static_cast<float>(layer.weight(i / layer.inputs, i % layer.inputs));
-  return found;
+// Every third bit of a Morton code, from the lowest on.
+int64_t every_third(int64_t code) {
+  auto x = static_cast<uint64_t>(code) & 0x1249249249249249;
+  x = (x | x >> 2) & 0x10c30c30c30c30c3;
+  x = (x | x >> 4) & 0x100f00f00f00f00f;
+  x = (x | x >> 8) & 0x1f0000ff0000ff;
+  x = (x | x >> 16) & 0x1f00000000ffff;
+  return static_cast<int64_t>((x | x >> 32) & 0x1fffff);
 }
+
+typedef float Four __attribute__((vector_size(16)));
+typedef float FourLoad __attribute__((vector_size(16), aligned(4)));
+constexpr int64_t WIDE = 4, AT_ONCE = 4 * WIDE;  // outputs whose sums are kept in registers
+
+// A layer as [inputs, padded outputs].
+struct Turned {
+  int64_t inputs, outputs, padded;
+  Buffer<float> weights, bias;
+
+  explicit Turned(const EightBitLayer& layer)
+      : inputs(layer.inputs), outputs(layer.outputs), padded((outputs + AT_ONCE - 1) / AT_ONCE * AT_ONCE),
+        weights(inputs * padded), bias(padded) {
+    weights.clear(), bias.clear();
+    for (int64_t i = 0; i < outputs; ++i) {
+      bias[i] = static_cast<float>(layer.bias(i));
+      for (int64_t k = 0; k < inputs; ++k) weights[padded * k + i] = static_cast<float>(layer.weight(i, k));
+    }
+  }
+  // Adds products of inputs `first` and on to some sums.
+  [[gnu::always_inline]] void add(int64_t output, int64_t first, const float* in, int64_t count, Four* sum) const {
+    const float* w = weights.data + padded * first + output;
+    for (int64_t k = 0; k < count; ++k, w += padded)
+#pragma GCC unroll 4
+      for (int64_t v = 0; v < WIDE; ++v) sum[v] += *reinterpret_cast<const FourLoad*>(w + 4 * v) * (Four{} + in[k]);
+  }
+  [[gnu::always_inline]] void begin(int64_t output, Four* sum) const {
+#pragma GCC unroll 4
+    for (int64_t v = 0; v < WIDE; ++v) sum[v] = *reinterpret_cast<const FourLoad*>(bias.data + output + 4 * v);
+  }
+};
+
+void put_four(float* to, Four x) { *reinterpret_cast<FourLoad*>(to) = x; }
+
+// What puts Gaussians. Some rows a call: an engine takes its better code for a function at the next call of it.
+struct Painter {
+  Values values;
+  const Splats& splats;
+  const Appearance& looks;
+  const Gaussians& to;
+  Turned basis, hidden, last;
+  Buffer<float> inner, rest;
+  double log_edge, thinnest;
+
+  Painter(const Splats& all, const Appearance& how, const ExactTables& tables, const Gaussians& target)
+      : values(all, how, tables), splats(all), looks(how), to(target), basis(how.basis), hidden(how.hidden),
+        last(how.last), inner(hidden.padded), rest(last.padded), log_edge(std::log(how.edge)),
+        thinnest(std::log(1e-6 * how.edge)) {}
+
+  [[gnu::noinline]] void put(int64_t begin, int64_t end) {
+    for (int64_t row = begin; row < end; ++row) {
+      float number[NUMBERS];
+      values.put(row, number);
+      put_base(row, number);
+      put_harmonics(row, number);
+    }
+  }
+  void put_base(int64_t row, const float* number) const {
+    const int64_t level = splats.levels[row];
+    const double edge = looks.edge / static_cast<double>(int64_t{1} << level);
+    for (int axis = 0; axis < 3; ++axis) {
+      const auto cell = static_cast<double>(every_third(splats.codes[row] >> axis));
+      to.means[3 * row + axis] = static_cast<float>(looks.low[axis] + (cell + 0.5) * edge);
+    }
+    to.opacity_logits[row] = number[0];
+    const auto own = static_cast<float>(log_edge - 0.6931471805599453 * static_cast<double>(level));
+    put_shape(number + 1, number[6] + own, thinnest, log_edge, to.log_scales + 3 * row, to.quats + 4 * row);
+    const double y = number[7] / std::sqrt(3.0), c1 = number[8] / ROOT_2, c2 = number[9] / ROOT_6;
+    const double rgb[3] = {y + c1 - c2, y + 2 * c2, y - c1 - c2};
+    for (int c = 0; c < 3; ++c) to.sh_dc[3 * row + c] = static_cast<float>((rgb[c] - 0.5) / C0);
+  }
+  void put_harmonics(int64_t row, const float* number) const {
+    const int64_t latents = LATENTS.width();
+    Four sum[WIDE];
+    for (int64_t i = 0; i < hidden.padded; i += AT_ONCE) {
+      hidden.begin(i, sum);
+      hidden.add(i, 0, number + LATENTS.first, latents, sum);
+      hidden.add(i, latents, number + 7, COLOURS, sum);
+#pragma GCC unroll 4
+      for (int64_t v = 0; v < WIDE; ++v) put_four(inner.data + i + 4 * v, sum[v] > 0 ? sum[v] : Four{});
+    }
+    for (int64_t i = 0; i < last.padded; i += AT_ONCE) {
+      last.begin(i, sum);
+      last.add(i, 0, inner.data, last.inputs, sum);
+      basis.add(i, 0, number + LATENTS.first, latents, sum);
+#pragma GCC unroll 4
+      for (int64_t v = 0; v < WIDE; ++v) put_four(rest.data + i + 4 * v, sum[v]);
+    }
+    std::memcpy(to.sh_rest + last.outputs * row, rest.data, sizeof(float) * static_cast<size_t>(last.outputs));
+  }
+};
 
 }  // namespace
 
@@ -138,41 +232,11 @@ void put_gaussians(const Splats& splats, const Appearance& looks, const ExactTab
       last.outputs != outputs || last.inputs != hidden.outputs)
     refuse("no appearance network has layers (", basis.outputs, ", ", basis.inputs, "), (", hidden.outputs, ", ",
            hidden.inputs, "), (", last.outputs, ", ", last.inputs, ")");
-  const Buffer<float> b = floats(basis), w1 = floats(hidden), w2 = floats(last);
-  Buffer<float> inner(hidden.outputs);
-  Values values(splats, looks, tables);
   const Gaussians to(splats.count, looks.sh_degree, 3);
-  const double log_edge = std::log(looks.edge), thinnest = std::log(1e-6 * looks.edge);
-  for (int64_t row = 0; row < splats.count; ++row) {
-    float number[NUMBERS];
-    values.put(row, number);
-    const int64_t level = splats.levels[row];
-    const double edge = looks.edge / static_cast<double>(int64_t{1} << level);
-    for (int axis = 0; axis < 3; ++axis) {
-      int64_t cell = 0;
-      for (int64_t bit = 0; bit < level; ++bit) cell |= (splats.codes[row] >> (3 * bit + axis) & 1) << bit;
-      to.means[3 * row + axis] = static_cast<float>(looks.low[axis] + (static_cast<double>(cell) + 0.5) * edge);
-    }
-    to.opacity_logits[row] = number[0];
-    const auto own = static_cast<float>(log_edge - 0.6931471805599453 * static_cast<double>(level));
-    put_shape(number + 1, number[6] + own, thinnest, log_edge, to.log_scales + 3 * row, to.quats + 4 * row);
-    const double y = number[7] / std::sqrt(3.0), c1 = number[8] / ROOT_2, c2 = number[9] / ROOT_6;
-    const double rgb[3] = {y + c1 - c2, y + 2 * c2, y - c1 - c2};
-    for (int c = 0; c < 3; ++c) to.sh_dc[3 * row + c] = static_cast<float>((rgb[c] - 0.5) / C0);
-    for (int64_t i = 0; i < hidden.outputs; ++i) {
-      const float* w = w1.data + hidden.inputs * i;
-      auto sum = static_cast<float>(hidden.bias(i));
-      for (int64_t k = 0; k < latents; ++k) sum += w[k] * number[LATENTS.first + k];
-      for (int64_t k = 0; k < COLOURS; ++k) sum += w[latents + k] * number[7 + k];
-      inner[i] = sum > 0 ? sum : 0;
-    }
-    for (int64_t i = 0; i < outputs; ++i) {
-      auto sum = static_cast<float>(last.bias(i));
-      for (int64_t k = 0; k < last.inputs; ++k) sum += w2[last.inputs * i + k] * inner[k];
-      for (int64_t k = 0; k < latents; ++k) sum += b[latents * i + k] * number[LATENTS.first + k];
-      to.sh_rest[outputs * row + i] = sum;
-    }
-  }
+  Painter painter(splats, looks, tables, to);
+  constexpr int64_t SOME = 256;
+  for (int64_t row = 0; row < splats.count; row += SOME)
+    painter.put(row, row + SOME < splats.count ? row + SOME : splats.count);
   decoded.check_finite();
 }
 
