@@ -50,6 +50,7 @@ inline void add_products(const double* in, int64_t stride, const double* weights
 
 // Numbers in two parts: x = high << bits | low, with 0 <= low < 2^bits or -2^(bits - 1) <= low < 2^(bits - 1).
 constexpr int WEIGHT_BITS = 15, INPUT_BITS = 10;
+constexpr double WHOLE = 1LL << 52;
 constexpr int32_t SMALL = 32767;  // of 16-bit inputs: two products of -32768 would be 2^31
 constexpr int32_t PART = 1 << INPUT_BITS;  // what parts of inputs up to 2^20 do not exceed
 
@@ -77,10 +78,11 @@ inline Sum pair_sums(Pair a, Pair b) {
 #endif
 }
 
-// Adds `factor` times the products to sums of four rows, [4, TILE]; weights [pairs, TILE, 2].
-inline void add_pairs(const int16_t* in, int64_t stride, const int16_t* weights, int64_t pairs, double factor,
-                      double* sums) {
-  for (int part = 0; part < TILE; part += WIDE * SUMS) {
+// Adds `factor` times those of the outputs times the products to the first sums of four rows, [4, TILE]; weights
+// [pairs, TILE, 2].
+inline void add_pairs(const int16_t* in, int64_t stride, const int16_t* weights, int64_t pairs, int64_t outputs,
+                      const double* factors, double factor, double* sums) {
+  for (int part = 0; part < outputs; part += WIDE * SUMS) {
     Sum sum[4][WIDE] = {};
     for (int64_t k = 0; k < pairs; ++k) {
       Pair w[WIDE];
@@ -103,13 +105,13 @@ inline void add_pairs(const int16_t* in, int64_t stride, const int16_t* weights,
       for (int c = 0; c < WIDE * SUMS; c += LANES) {
         double* to = sums + r * TILE + part + c;
         const Narrow x = *reinterpret_cast<const NarrowLoad*>(found[r] + c);
-        store(to, load(to) + __builtin_convertvector(x, Vec) * all(factor));
+        store(to, load(to) + __builtin_convertvector(x, Vec) * (load(factors + part + c) * all(factor)));
       }
   }
 }
 #else
 constexpr bool HAS_PAIRS = false;
-inline void add_pairs(const int16_t*, int64_t, const int16_t*, int64_t, double, double*) {}
+inline void add_pairs(const int16_t*, int64_t, const int16_t*, int64_t, int64_t, const double*, double, double*) {}
 #endif
 
 // A layer in tiles of outputs, zeros behind the last one.
@@ -117,14 +119,15 @@ struct Tiles {
   int64_t inputs, outputs, pairs, tiles;
   Scratch<double> weights;  // [tiles, inputs, TILE]
   Scratch<double> bias;     // [tiles * TILE]
-  Scratch<int16_t> low, high;  // [tiles, pairs, TILE, 2]
+  Scratch<int16_t> low, high;  // [tiles, pairs, TILE, 2] divided by `factor`
+  Scratch<double> factor;      // [tiles * TILE] the power of two that all weights of an output share
   Scratch<int32_t> parts;      // [tiles] of the weights: 1 low, 2 low and high, 0 neither holds them
   Scratch<int64_t> reach;      // [tiles] inputs up to this give sums below 2^31
 
   explicit Tiles(const splatwizard::Layer& l)
       : inputs(l.inputs), outputs(l.outputs), pairs((l.inputs + 1) / 2), tiles((l.outputs + TILE - 1) / TILE),
         weights(tiles * inputs * TILE), bias(tiles * TILE), low(tiles * pairs * TILE * 2),
-        high(tiles * pairs * TILE * 2), parts(tiles), reach(tiles) {
+        high(tiles * pairs * TILE * 2), factor(tiles * TILE), parts(tiles), reach(tiles) {
     for (int64_t t = 0; t < tiles; ++t) pack(l, t);
   }
   int64_t padded() const { return tiles * TILE; }
@@ -133,17 +136,24 @@ struct Tiles {
   void pack(const splatwizard::Layer& l, int64_t t) {
     const int64_t first = t * TILE, count = outputs - first < TILE ? outputs - first : TILE;
     double* w = weights.data + first * inputs;
-    double largest = 0;
+    int64_t largest = 0;
     bool whole = HAS_PAIRS;
     for (int64_t i = 0; i < TILE; ++i) {
       bias[first + i] = i < count ? l.bias[first + i] : 0;
+      int64_t bits = 0;
       for (int64_t k = 0; k < inputs; ++k) {
-        const double x = i < count ? l.weights[(first + i) * inputs + k] : 0, size = x < 0 ? -x : x;
-        w[k * TILE + i] = x;
+        const double x = w[k * TILE + i] = i < count ? l.weights[(first + i) * inputs + k] : 0;
+        whole &= x > -WHOLE && x < WHOLE && x == static_cast<double>(static_cast<int64_t>(x));
+        bits |= whole ? static_cast<int64_t>(x < 0 ? -x : x) : 0;
+      }
+      const int64_t shared = bits & -bits;
+      factor[first + i] = shared ? static_cast<double>(shared) : 1;
+      for (int64_t k = 0; k < inputs && whole; ++k) {
+        const auto x = static_cast<int64_t>(w[k * TILE + i] / factor[first + i]), size = x < 0 ? -x : x;
         largest = size > largest ? size : largest;
-        whole &= size < (1 << 29) && x == static_cast<double>(static_cast<int32_t>(x));
       }
     }
+    whole &= largest < 1 << 29;
     parts[t] = !whole ? 0 : largest <= SMALL ? 1 : 2;
     reach[t] = 0;
     if (!whole) return;
@@ -152,7 +162,7 @@ struct Tiles {
     for (int64_t i = 0; i < TILE; ++i) {
       int64_t sum = 0, sum_above = 0;
       for (int64_t k = 0; k < 2 * pairs; ++k) {
-        const int32_t x = k < inputs ? static_cast<int32_t>(w[k * TILE + i]) : 0;
+        const int32_t x = k < inputs ? static_cast<int32_t>(w[k * TILE + i] / factor[first + i]) : 0;
         const int32_t top = parts[t] == 1 ? 0 : (x + (1 << (WEIGHT_BITS - 1))) >> WEIGHT_BITS;
         const int32_t rest = x - top * (1 << WEIGHT_BITS);
         const int64_t at = 2 * (k / 2 * TILE + i) + k % 2;
@@ -210,6 +220,7 @@ struct Rows {
 // Sums of a tile for n rows, [BLOCK, TILE], bias included; what is behind row n is of no use.
 inline void tile_sums(const Tiles& l, int64_t t, Rows& rows, int64_t n, double* sums) {
   for (int64_t r = 0; r < BLOCK; ++r) std::memcpy(sums + r * TILE, l.bias.data + t * TILE, sizeof(double) * TILE);
+  const int64_t outputs = l.outputs - t * TILE < TILE ? l.outputs - t * TILE : TILE;
   const bool small = rows.most <= SMALL && rows.most <= l.reach[t];
   if (l.parts[t] == 0 || (!small && PART > l.reach[t])) {
     rows.as_real();
@@ -217,7 +228,7 @@ inline void tile_sums(const Tiles& l, int64_t t, Rows& rows, int64_t n, double* 
       const double* weights = l.weights.data + (t * l.inputs + k) * TILE;
       const int64_t deep = l.inputs - k < DEEP ? l.inputs - k : DEEP;
       for (int64_t r = 0; r < n; r += ROWS)
-        for (int part = 0; part < TILE; part += WIDE * LANES)
+        for (int part = 0; part < outputs; part += WIDE * LANES)
           add_products(rows.real.data + r * rows.stride + k, rows.stride, weights + part, deep,
                        sums + r * TILE + part);
     }
@@ -230,7 +241,8 @@ inline void tile_sums(const Tiles& l, int64_t t, Rows& rows, int64_t n, double* 
       const int16_t* weights = (top_weight ? l.high.data : l.low.data) + 2 * t * TILE * l.pairs;
       const auto factor = static_cast<double>(int64_t{1} << (INPUT_BITS * top_input + WEIGHT_BITS * top_weight));
       for (int64_t r = 0; r < n; r += 4)
-        add_pairs(in + r * rows.stride, rows.stride, weights, l.pairs, factor, sums + r * TILE);
+        add_pairs(in + r * rows.stride, rows.stride, weights, l.pairs, outputs, l.factor.data + t * TILE, factor,
+                  sums + r * TILE);
     }
 }
 

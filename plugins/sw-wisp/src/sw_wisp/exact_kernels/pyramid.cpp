@@ -25,11 +25,59 @@ void shrink(const double* sums, const double* above, double* found) {
   for (int64_t c = 0; c < WIDTH; ++c) found[c] = std::floor((sums[c] + PULL * above[c]) / count);
 }
 
-inline int64_t bounded(double x) { return static_cast<int64_t>(x < -LIMIT ? -LIMIT : x > LIMIT ? LIMIT : x); }
+// Means of the cells that are needed.
+void shrink_cells(const pyramid_features_call& a, int64_t begin, int64_t end) {
+  for (int64_t cell = begin; cell < end; ++cell) {
+    if (!a.needed[cell]) continue;
+    double* found = a.means + MEANS * cell;
+    if (cell == 0) {
+      std::memcpy(found, a.base_prior, sizeof(double) * 2 * BASE);
+      std::memcpy(found + 2 * BASE, a.view_prior, sizeof(double) * 2 * VIEW);
+      continue;
+    }
+    const double* above = a.means + MEANS * a.parent[cell];
+    shrink<2 * BASE>(a.base_sums ? a.base_sums + (2 * BASE + 1) * cell : nullptr, above, found);
+    shrink<2 * VIEW>(a.view_sums ? a.view_sums + (2 * VIEW + 1) * cell : nullptr, above + 2 * BASE, found + 2 * BASE);
+  }
+}
+
+template <class T>
+T bounded(double x) {
+  return static_cast<T>(x < -LIMIT ? -LIMIT : x > LIMIT ? LIMIT : x);
+}
+
+// What splat `row` sees of the means around it.
+template <class T>
+void see(const pyramid_features_call& a, int64_t row, T* to) {
+  const int64_t level = a.levels[row], leaf = a.leaf[row];
+  // The finest cell around the splat, of this level at most.
+  const auto around = [&](int64_t most) {
+    int64_t at = leaf;
+    for (int64_t up = a.depth[leaf] - most; up > 0; --up) at = a.parent[at];
+    return at;
+  };
+  const auto put = [&](int64_t cell, int64_t activities) {
+    const double *base = a.means + MEANS * cell + activities * BASE,
+                 *view = a.means + MEANS * cell + 2 * BASE + activities * VIEW;
+    for (int64_t c = 0; c < BASE; ++c) to[c] = bounded<T>(base[c]);
+    for (int64_t c = 0; c < VIEW; ++c) to[BASE + c] = bounded<T>(view[c]);
+    to += BASE + VIEW;
+  };
+  const int64_t at[2] = {level < DEEPEST ? level : DEEPEST, level - 3};
+  const int64_t cell[2] = {around(at[0]), around(at[1])};
+  for (int64_t each : cell) put(each, 0);
+  put(around(level - 1 < DEEPEST ? level - 1 : DEEPEST), 1);
+  *to++ = static_cast<T>(level) * static_cast<T>(SIXTEENTH);
+  for (int k = 0; k < 2; ++k) {
+    const bool is_shared = a.base_sums != nullptr && a.depth[cell[k]] >= at[k];
+    const double count = is_shared ? a.base_sums[(2 * BASE + 1) * cell[k] + 2 * BASE] : 0;
+    *to++ = static_cast<T>((count < MOST_COUNTED ? count : MOST_COUNTED) * SIXTEENTH);
+  }
+}
 
 }  // namespace
 
-void pyramid_features(const pyramid_features_call& a, const Parallel& parallel) {
+void pyramid_means(const pyramid_features_call& a, const Parallel& parallel) {
   std::memset(a.needed, 0, static_cast<size_t>(a.cells));
   for (int64_t i = 0; i < a.n; ++i)
     for (int64_t at = a.leaf[a.rows[i]]; !a.needed[at]; at = a.parent[at]) {
@@ -38,46 +86,18 @@ void pyramid_features(const pyramid_features_call& a, const Parallel& parallel) 
     }
   for (int64_t level = 0; level <= DEEPEST; ++level)
     parallel(a.starts[level + 1] - a.starts[level], 256, [&](int64_t begin, int64_t end) {
-      for (int64_t cell = a.starts[level] + begin; cell < a.starts[level] + end; ++cell) {
-        if (!a.needed[cell]) continue;
-        double* found = a.means + MEANS * cell;
-        if (cell == 0) {
-          std::memcpy(found, a.base_prior, sizeof(double) * 2 * BASE);
-          std::memcpy(found + 2 * BASE, a.view_prior, sizeof(double) * 2 * VIEW);
-          continue;
-        }
-        const double* above = a.means + MEANS * a.parent[cell];
-        shrink<2 * BASE>(a.base_sums ? a.base_sums + (2 * BASE + 1) * cell : nullptr, above, found);
-        shrink<2 * VIEW>(a.view_sums ? a.view_sums + (2 * VIEW + 1) * cell : nullptr, above + 2 * BASE,
-                         found + 2 * BASE);
-      }
+      shrink_cells(a, a.starts[level] + begin, a.starts[level] + end);
     });
+}
+
+void pyramid_seen(const pyramid_features_call& a, const int64_t* rows, int64_t n, int64_t stride, int32_t* found) {
+  for (int64_t i = 0; i < n; ++i) see(a, rows[i], found + stride * i);
+}
+
+void pyramid_features(const pyramid_features_call& a, const Parallel& parallel) {
+  pyramid_means(a, parallel);
   parallel(a.n, 256, [&](int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) {
-      const int64_t row = a.rows[i], level = a.levels[row], leaf = a.leaf[row];
-      int64_t* to = a.found + FEATURES * i;
-      // The finest cell around the splat, of this level at most.
-      const auto around = [&](int64_t most) {
-        int64_t at = leaf;
-        for (int64_t up = a.depth[leaf] - most; up > 0; --up) at = a.parent[at];
-        return at;
-      };
-      const auto put = [&](int64_t cell, int64_t activities) {
-        const double* from = a.means + MEANS * cell;
-        for (int64_t c = 0; c < BASE; ++c) *to++ = bounded(from[activities * BASE + c]);
-        for (int64_t c = 0; c < VIEW; ++c) *to++ = bounded(from[2 * BASE + activities * VIEW + c]);
-      };
-      const int64_t at[2] = {level < DEEPEST ? level : DEEPEST, level - 3};
-      const int64_t cell[2] = {around(at[0]), around(at[1])};
-      for (int64_t each : cell) put(each, 0);
-      put(around(level - 1 < DEEPEST ? level - 1 : DEEPEST), 1);
-      *to++ = level * static_cast<int64_t>(SIXTEENTH);
-      for (int k = 0; k < 2; ++k) {
-        const bool is_shared = a.base_sums != nullptr && a.depth[cell[k]] >= at[k];
-        const double count = is_shared ? a.base_sums[(2 * BASE + 1) * cell[k] + 2 * BASE] : 0;
-        *to++ = static_cast<int64_t>((count < MOST_COUNTED ? count : MOST_COUNTED) * SIXTEENTH);
-      }
-    }
+    for (int64_t i = begin; i < end; ++i) see(a, a.rows[i], a.found + FEATURES * i);
   });
 }
 

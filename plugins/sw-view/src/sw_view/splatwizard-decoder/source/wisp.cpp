@@ -197,6 +197,7 @@ struct Walk {
     if (part.count == 0) return;
     const Span columns = BLOCKS[number];
     Prediction found(part.count, columns.width());
+    if (number == 0 || number == 3) context.look(part, splats);  // blocks 1 and 2 follow 0 with the same rows
     context.predict(number, part, splats, found);
     for (int64_t i = 0; i < part.count; ++i)
       for (int64_t c = 0; c < columns.width(); ++c)
@@ -253,6 +254,7 @@ struct Walk {
       for (end = first + 1; end < splats.count && splats.has_view[end] == splats.has_view[first];) ++end;
       if (splats.has_view[first]) continue;
       const Rows all{first, 1, end - first};
+      context.look(all, splats);
       for (int64_t begin = 0; begin < all.count; begin += AT_ONCE) {
         const Rows part = all.part(begin, AT_ONCE);
         Prediction found(part.count, columns.width());
@@ -410,7 +412,7 @@ void put_integers(Sha256& sha) {
 Splats::Splats(int64_t rows)
     : most(rows), levels(rows), codes(rows), mean(NUMBERS * rows), scale(NUMBERS * rows), multiplier(NUMBERS * rows),
       index(NUMBERS * rows), missing(rows), has_view(rows) {
-  for (const auto* table : {&mean, &scale, &multiplier, &index}) table->clear();
+  index.clear();  // of latents that no packet holds
   has_view.clear();
 }
 

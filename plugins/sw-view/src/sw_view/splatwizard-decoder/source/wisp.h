@@ -63,6 +63,8 @@ struct Prediction {
 struct Context {
   int base_parts, later_parts;  // of the packets of the first subset, and of others
 
+  // Goes before `predict` for some of these rows, after whatever changes what is known.
+  virtual void look(Rows, const Splats&) {}
   virtual void predict(int block, Rows rows, const Splats& splats, Prediction& to) = 0;
   // What the pieces before `piece` of a block add to the mean and scale of its numbers, in one row.
   virtual void tie(int block, int piece, int64_t row, const Splats& splats, int64_t* mean, int64_t* scale) const = 0;

@@ -2,6 +2,7 @@
 #include <new>
 
 #include <exact_kernels/kernels.h>
+#include <network.h>
 
 #include "wisp.h"
 
@@ -16,6 +17,16 @@ constexpr int64_t ADAPTIVE = 1, SMALL = 2;  // flags of the file
 constexpr splatwizard::Parallel ALONE;
 
 int64_t outputs_of(int block) { return 2 * BLOCKS[block].width() + STEPS[block]; }
+
+// The largest magnitude of some numbers and `most`.
+int64_t largest(const int32_t* numbers, int64_t count, int64_t most) {
+  int32_t found = 0;
+  for (int64_t i = 0; i < count; ++i) {
+    const int32_t size = numbers[i] < 0 ? -numbers[i] : numbers[i];
+    found = size > found ? size : found;
+  }
+  return found > most ? found : most;
+}
 
 template <class T>
 Buffer<T> zeros(int64_t count) {
@@ -38,8 +49,7 @@ struct Pyramid final : Context {
   const ExactTables& tables;
   bool adaptive;
   double priors[MEANS];          // values and activities of base, then of latents
-  Buffer<double> weights[8], biases[8];
-  splatwizard::Layer layers[8];
+  const arch_native::Packed* networks[4];
   Buffer<int64_t> ties[4][3];    // [2 c, n] weights with 12 fractional bits
   int64_t sizes[64];             // of a step, by table
   int64_t splats_known = 0, cells = 0, starts[DEEPEST + 2] = {};
@@ -52,7 +62,7 @@ struct Pyramid final : Context {
   explicit Pyramid(const ExactTables& exact) : tables(exact) {}
 
   // Takes in splats that are not known yet.
-  void announce(const Splats& splats) {
+  [[gnu::noinline]] void announce(const Splats& splats) {
     const int64_t before = splats_known, n = splats.count;
     Buffer<int64_t> codes(n);
     for (int64_t i = 0; i < n; ++i) {
@@ -101,7 +111,7 @@ struct Pyramid final : Context {
   }
 
   // Cells of two splats or more, by level and code; their parents; the finest of them around each splat.
-  void find_cells(const Splats& splats) {
+  [[gnu::noinline]] void find_cells(const Splats& splats) {
     int64_t left = splats.count;
     merge(left);
     Buffer<int32_t> order(left);
@@ -155,14 +165,14 @@ struct Pyramid final : Context {
       for (int64_t cell = starts[level]; cell < starts[level + 1]; ++cell) depth[cell] = level;
   }
 
-  void features(const int64_t* rows, int64_t n, const Splats& splats, int64_t* found) {
+  pyramid_features_call call_of(const int64_t* rows, int64_t n, const Splats& splats) const {
     pyramid_features_call call{};
     call.rows = rows, call.n = n, call.splats = splats.count, call.cells = cells;
     call.levels = splats.levels.data, call.leaf = leaf.data, call.parent = parent.data, call.depth = depth.data;
     call.starts = starts, call.base_prior = priors, call.view_prior = priors + 2 * BASE.width();
     call.base_sums = base.at_hand(), call.view_sums = view.at_hand();
-    call.needed = needed.data, call.means = means.data, call.found = found;
-    arch_native::pyramid_features(call, ALONE);
+    call.needed = needed.data, call.means = means.data;
+    return call;
   }
 
   void add(const int64_t* rows, int64_t n, const int64_t* values, const int64_t* indices, int64_t first,
@@ -175,32 +185,39 @@ struct Pyramid final : Context {
     arch_native::pyramid_add(call, ALONE);
   }
 
-  void predict(int block, Rows rows, const Splats& splats, Prediction& to) override {
+  void look(Rows rows, const Splats& splats) override {
     if (splats_known < splats.count) announce(splats);
-    const int64_t most = rows.count < AT_ONCE ? rows.count : AT_ONCE, known = BLOCKS[block].first;
-    const int64_t width = BLOCKS[block].width(), outputs = outputs_of(block);
-    Buffer<int64_t> number(most), seen(FEATURES * most), values(known * most), found(outputs * most);
-    for (int64_t begin = 0; begin < rows.count; begin += most) {
-      const Rows some = rows.part(begin, most);
-      for (int64_t i = 0; i < some.count; ++i) {
-        number[i] = some[i];
-        for (int64_t c = 0; c < known; ++c) values[known * i + c] = splats.unit(some[i], c);
+    Buffer<int64_t> number(rows.count);
+    for (int64_t i = 0; i < rows.count; ++i) number[i] = rows[i];
+    arch_native::pyramid_means(call_of(number.data, rows.count, splats), ALONE);
+  }
+
+  void predict(int block, Rows rows, const Splats& splats, Prediction& to) override {
+    const int64_t known = BLOCKS[block].first, width = BLOCKS[block].width();
+    const pyramid_features_call call = call_of(nullptr, 0, splats);
+    int32_t own[arch_native::BLOCK * NUMBERS];
+    const auto inputs = [&](int64_t start, int64_t n, arch_native::Rows& in) {
+      int64_t number[arch_native::BLOCK];
+      for (int64_t r = 0; r < n; ++r) number[r] = rows[start + r];
+      arch_native::pyramid_seen(call, number, n, in.stride, in.value.data);
+      for (int64_t r = 0; r < n; ++r) {
+        int32_t* seen = in.value.data + in.stride * r;
+        std::memcpy(own + width * r, seen + known, sizeof(int32_t) * static_cast<size_t>(width));
+        for (int64_t c = 0; c < known; ++c)
+          seen[FEATURES + c] = static_cast<int32_t>(clamped(splats.unit(number[r], c), -VALUE_LIMIT, VALUE_LIMIT));
+        in.most = largest(seen, FEATURES + known, in.most);
       }
-      features(number.data, some.count, splats, seen.data);
-      splatwizard::NetworkArgs network{layers + 2 * block, 2, {seen.data, values.data}, {FEATURES, known},
-                                       {FEATURES, known}, nullptr, some.count, 0};
-      arch_native::network(network, found.data, ALONE);
-      for (int64_t i = 0; i < some.count; ++i) {
-        const int64_t *own = seen.data + FEATURES * i + known, *out = found.data + outputs * i;
-        int64_t at = width * (begin + i);
+    };
+    const auto outputs = [&](int64_t start, int64_t n, const double* found, int64_t stride) {
+      for (int64_t r = 0, at = width * start; r < n; ++r, found += stride)
         for (int64_t c = 0; c < width; ++c, ++at) {
-          to.mean[at] = own[c] + out[c];
-          to.scale[at] = out[width + c];
-          const int64_t step = out[2 * width + (block == 1 && c == width - 1)];
+          to.mean[at] = own[width * r + c] + static_cast<int64_t>(found[c]);
+          to.scale[at] = static_cast<int64_t>(found[width + c]);
+          const auto step = static_cast<int64_t>(found[2 * width + (block == 1 && c == width - 1)]);
           to.multiplier[at] = static_cast<int32_t>(adaptive ? tables.multiplier(step) : UNIT);
         }
-      }
-    }
+    };
+    arch_native::over_blocks(*networks[block], rows.count, 0, ALONE, inputs, outputs);
   }
 
   void tie(int block, int piece, int64_t row, const Splats& splats, int64_t* mean, int64_t* scale) const override {
@@ -272,6 +289,8 @@ Context& read_pyramid(Bytes& from, const ExactTables& tables) {
     found.priors[at] = 16 * static_cast<int16_t>(from.integer(2));
   }
   int lowest = HIGHEST_EXPONENT;
+  Buffer<double> weights[2], biases[2];
+  splatwizard::Layer layers[2];
   for (int i = 0; i < 8; ++i) {
     const int block = i / 2;
     const int64_t hidden = HIDDEN[block] / (flags & SMALL ? 2 : 1);
@@ -280,13 +299,14 @@ Context& read_pyramid(Bytes& from, const ExactTables& tables) {
     EightBitLayer layer;
     layer.read(from, outputs, inputs, true);
     lowest = layer.lowest() < lowest ? layer.lowest() : lowest;
-    found.weights[i] = Buffer<double>(outputs * inputs);
-    found.biases[i] = Buffer<double>(outputs);
+    Buffer<double>&own = weights[i % 2], &bias = biases[i % 2];
+    own = Buffer<double>(outputs * inputs), bias = Buffer<double>(outputs);
     for (int64_t row = 0; row < outputs; ++row) {
-      found.biases[i][row] = layer.bias(row) * (1 << 24);
-      for (int64_t c = 0; c < inputs; ++c) found.weights[i][inputs * row + c] = layer.weight(row, c) * UNIT;
+      bias[row] = layer.bias(row) * (1 << 24);
+      for (int64_t c = 0; c < inputs; ++c) own[inputs * row + c] = layer.weight(row, c) * UNIT;
     }
-    found.layers[i] = {found.weights[i].data, found.biases[i].data, inputs, outputs};
+    layers[i % 2] = {own.data, bias.data, inputs, outputs};
+    if (i % 2) found.networks[block] = new arch_native::Packed(layers, 2);
   }
   for (int block = 0; block < 4; ++block)
     for (int piece = 1; piece < PIECES_OF[block]; ++piece) {
