@@ -82,6 +82,18 @@ function decodedBy(module, bytes, packets, tables) {
   return { exports, text, guarded };
 }
 
+// Arrays of what an instance has decoded, by name, each { shape, data }: views of its memory.
+function arraysIn({ exports, text }) {
+  const FIELDS = 8, arrays = {};  // pointers to name and values, whether it is an index, number of axes, four lengths
+  const fields = new Uint32Array(exports.memory.buffer, exports.swz_arrays(), FIELDS * exports.swz_count());
+  for (let i = 0; i < fields.length; i += FIELDS) {
+    const shape = [...fields.subarray(i + 4, i + 4 + fields[i + 3])], size = shape.reduce((a, b) => a * b, 1);
+    const Values = fields[i + 2] ? Uint32Array : Float32Array;
+    arrays[text(fields[i])] = { shape, data: new Values(exports.memory.buffer, fields[i + 1], size) };
+  }
+  return arrays;
+}
+
 /**
  * The parameters in a file by name, each { shape, data: Float32Array }; with `hash` the SHA-256 of them, which
  * `sw decode --hash` prints; of a file with cuts `packets` may be how many to read. `tables` are the bytes of
@@ -89,15 +101,23 @@ function decodedBy(module, bytes, packets, tables) {
  * but the result.
  */
 export function parameters(module, bytes, { hash = false, packets = 0, tables = null } = {}) {
-  const { exports, text } = decodedBy(module, bytes, packets, tables);
-  const FIELDS = 8, arrays = {};  // pointers to name and values, whether it is an index, number of axes, four lengths
-  const fields = new Uint32Array(exports.memory.buffer, exports.swz_arrays(), FIELDS * exports.swz_count());
-  for (let i = 0; i < fields.length; i += FIELDS) {
-    const shape = [...fields.subarray(i + 4, i + 4 + fields[i + 3])], size = shape.reduce((a, b) => a * b, 1);
-    const Values = fields[i + 2] ? Uint32Array : Float32Array;
-    arrays[text(fields[i])] = { shape, data: new Values(exports.memory.buffer, fields[i + 1], size).slice() };
+  const instance = decodedBy(module, bytes, packets, tables), arrays = arraysIn(instance);
+  for (const array of Object.values(arrays)) array.data = array.data.slice();
+  return { arrays, hash: hash ? instance.text(instance.exports.swz_hash()) : null };
+}
+
+/**
+ * What `parameters` has of the first cut of a file with cuts, unless `coarse` is false, and then of all of it: each
+ * { arrays, whole }, which lie in the memory of an instance until the next are asked for.
+ */
+export function* refined(module, bytes, { coarse = true, tables = null } = {}) {
+  let first = null;
+  if (coarse && cutEnds(bytes).length > 1) {
+    first = decodedBy(module, bytes, 1, tables);
+    yield { arrays: arraysIn(first), whole: false };
   }
-  return { arrays, hash: hash ? text(exports.swz_hash()) : null };
+  const goesOn = first?.guarded(() => first.exports.swz_go_on(0));  // else the method of the file begins anew
+  yield { arrays: arraysIn(goesOn ? first : decodedBy(module, bytes, 0, tables)), whole: true };
 }
 
 /**

@@ -145,6 +145,7 @@ int64_t Container::choose_cut(const Json* rows, int64_t length, int64_t header_b
            grouped(first_end), " bytes");
   if (asked > there) refuse("it has ", there, " packets, ", asked, " are asked for");
   packets = asked ? asked : there;
+  is_first_part = packets < there;
   return chosen;
 }
 

@@ -20,6 +20,7 @@ struct Container {
   Section* sections = nullptr;
   int64_t count = 0, payload = 0;
   int64_t cuts = 0, packets = 0;  // declared, and read of them; of a file without cuts 0
+  bool is_first_part = false;     // more was there than was asked for
 
   // Reads the first packets of a file with cuts, `asked` of them; 0: all that are there.
   Container(Bytes file, int64_t asked);

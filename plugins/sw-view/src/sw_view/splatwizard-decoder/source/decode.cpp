@@ -1,7 +1,7 @@
 // What the module exports. A host gets `swz_input(bytes)`, writes the file there, for some methods `swz_tables(bytes)`
 // with what exact_tables.h says, and calls `swz_decode`; if that traps,
 // `swz_refusal` is the reason, or empty if the module itself failed. Then `swz_arrays` are read and copied, and the
-// instance is thrown away: it decodes one file.
+// instance is thrown away: it decodes one file, all at once or, by `swz_go_on`, in packets.
 #include "exact_tables.h"
 #include "methods.h"
 #include "model.h"
@@ -25,6 +25,8 @@ void decode(Container& file) {
 
 }  // namespace
 
+Decoder go_on = nullptr;
+
 EXPORT(swz_input) uint8_t* swz_input(int32_t bytes) {
   input = Buffer<uint8_t>(bytes);
   return input.data;
@@ -42,6 +44,16 @@ EXPORT(swz_decode) void swz_decode(int32_t packets) {
   decode(file);
 }
 
+// Goes on to the first `packets` of the same file, 0: to all, without what is decoded already. Returns 1, or 0 where
+// the method of the file begins anew instead, in another instance. Arrays that were read before are gone.
+EXPORT(swz_go_on) int32_t swz_go_on(int32_t packets) {
+  if (go_on == nullptr) return 0;
+  Container file(Bytes{input.data, input.size}, packets);
+  go_on(file);
+  file.finish();
+  return 1;
+}
+
 EXPORT(swz_refusal) const char* swz_refusal() { return refusal.data; }
 
 // Arrays of the model, `swz_count` of them: pointers to name and values, whether it is an index, number of axes
@@ -55,9 +67,7 @@ EXPORT(swz_hash) const char* swz_hash() {
   if (hash_of_integers != nullptr) hash_of_integers(sha);
   for (int i = 0; i < decoded.count && hash_of_integers == nullptr; ++i) {
     if (decoded.arrays[i].is_index) continue;
-    int64_t size = 4;
-    for (int axis = 0; axis < decoded.arrays[i].axes; ++axis) size *= decoded.arrays[i].shape[axis];
-    sha.put(decoded.arrays[i].data, size);
+    sha.put(decoded.arrays[i].data, 4 * decoded.arrays[i].size());
   }
   sha.finish(hash);
   return hash;

@@ -6,6 +6,9 @@ namespace swz {
 
 using Decoder = void (*)(Container& file);
 
+// Goes on behind the packets that it has decoded, where a decoder set it: what a file with more of them adds.
+extern Decoder go_on;
+
 // Refuses what the module does not know.
 Decoder decoder_of(const Container& file);
 

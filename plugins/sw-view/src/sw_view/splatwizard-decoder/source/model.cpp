@@ -5,6 +5,20 @@ namespace swz {
 Model3D decoded;
 void (*hash_of_integers)(Sha256& sha) = nullptr;
 
+int64_t Array::size() const {
+  int64_t found = 1;
+  for (int axis = 0; axis < axes; ++axis) found *= shape[axis];
+  return found;
+}
+
+void Model3D::clear() {
+  while (count > 0) {
+    const Array& last = arrays[--count];
+    Buffer<float> values;
+    values.data = static_cast<float*>(last.data), values.size = last.size();
+  }
+}
+
 float* Model3D::add(const char* name, int64_t first, int64_t second, int64_t third) {
   Array& array = arrays[count++];
   array = {name, nullptr, 0, 0, {}};
@@ -31,8 +45,7 @@ void Model3D::check_finite() const {
   for (int i = 0; i < count; ++i) {
     if (arrays[i].is_index) continue;
     const auto* data = static_cast<const float*>(arrays[i].data);
-    int64_t size = 1;
-    for (int axis = 0; axis < arrays[i].axes; ++axis) size *= arrays[i].shape[axis];
+    const int64_t size = arrays[i].size();
     for (int64_t k = 0; k < size; ++k)
       if (!__builtin_isfinite(data[k]))
         refuse("decoded '", arrays[i].name, "' is not finite: the file is damaged or hostile");

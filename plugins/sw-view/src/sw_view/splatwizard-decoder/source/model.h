@@ -13,6 +13,8 @@ struct Array {
   int32_t is_index;  // 0: float32, part of the hash; 1: uint32, which rows of other arrays a Gaussian takes
   int32_t axes;
   uint32_t shape[4];
+
+  int64_t size() const;
 };
 
 struct Model3D {
@@ -22,6 +24,7 @@ struct Model3D {
   // A new array [first, ...] of zeros; an axis of -1 is none.
   float* add(const char* name, int64_t first, int64_t second = -1, int64_t third = -1);
   uint32_t* add_index(const char* name, int64_t length);
+  void clear();
   // Refuses numbers that are not finite.
   void check_finite() const;
 };

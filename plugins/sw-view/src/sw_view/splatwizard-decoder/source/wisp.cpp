@@ -6,6 +6,7 @@
 #include <ranges.h>
 
 #include "gaussian_files.h"
+#include "methods.h"
 #include "model.h"
 #include "sha256.h"
 
@@ -129,6 +130,7 @@ struct Walk {
     if (packet.kind == BASE_KIND) {
       own = {splats.count, 1, packet.rows};
       if (packet.rows) octree(stream, packet.rows);
+      std::memset(splats.missing.data + own.first, static_cast<int>(planes), static_cast<size_t>(packet.rows));
     }
     if (packet.kind == FINE_KIND) {
       for (int64_t begin = 0; begin < own.count; begin += AT_ONCE) refine(stream, own.part(begin, AT_ONCE));
@@ -392,15 +394,53 @@ int64_t check_sections(const Container& file, const Order& order) {
   return file.count - 1;
 }
 
-const Splats* hashed;
+// Rows of the packets that are there; refuses more than the file may stand for.
+int64_t rows_there(const Container& file, const Order& order) {
+  int64_t rows = 0;
+  for (int64_t i = 0; i < check_sections(file, order); ++i)
+    rows += order.packets[i].kind == BASE_KIND ? order.packets[i].rows : 0;
+  file.allow(BYTES_OF_A_ROW * rows, rows);
+  return rows;
+}
+
+// A file of which some packets are decoded.
+struct Coded {
+  Appearance looks;
+  Order order;
+  Context& context;
+  Walk walk;
+  int64_t done = 0;
+
+  void go_on(Container& file) {
+    const int64_t packets = check_sections(file, order);
+    file.section("networks");  // read before
+    walk.splats.make_room(rows_there(file, order));
+    for (int64_t i = 0; i < packets; ++i) {
+      const Bytes content = file.section(section_of(i));
+      if (i < done) continue;
+      char name[16];
+      std::strcpy(name, section_of(i));
+      const Blame blame(name);
+      walk.packet(order.packets[i], content);
+    }
+    done = packets;
+    walk.finish();
+    if (!file.is_first_part) context.forget();
+    const Blame blame("networks");
+    put_gaussians(walk.splats, looks, walk.tables);
+  }
+};
+
+Coded* coded = nullptr;
 
 // Level, cell, indices, means and multipliers of each row.
 void put_integers(Sha256& sha) {
-  for (int64_t row = 0; row < hashed->count; ++row) {
-    int32_t values[4 + 3 * NUMBERS] = {static_cast<int32_t>(hashed->levels[row])};
+  const Splats& splats = coded->walk.splats;
+  for (int64_t row = 0; row < splats.count; ++row) {
+    int32_t values[4 + 3 * NUMBERS] = {static_cast<int32_t>(splats.levels[row])};
     for (int64_t bit = 0; bit < 3 * HIGHEST_LEVEL; ++bit)
-      values[1 + bit % 3] |= (hashed->codes[row] >> bit & 1) << bit / 3;
-    const Buffer<int32_t>* parts[] = {&hashed->index, &hashed->mean, &hashed->multiplier};
+      values[1 + bit % 3] |= (splats.codes[row] >> bit & 1) << bit / 3;
+    const Buffer<int32_t>* parts[] = {&splats.index, &splats.mean, &splats.multiplier};
     for (int64_t i = 0; i < 3; ++i)
       std::memcpy(values + 4 + NUMBERS * i, parts[i]->data + NUMBERS * row, sizeof(int32_t) * NUMBERS);
     sha.put(values, sizeof(values));
@@ -416,8 +456,21 @@ Splats::Splats(int64_t rows)
   has_view.clear();
 }
 
+void Splats::make_room(int64_t rows) {
+  if (rows <= most) return;
+  Splats larger(rows);
+  const auto keep = [&](auto& own, const auto& from, int64_t width) {
+    std::memcpy(own.data, from.data, sizeof(*own.data) * static_cast<size_t>(width * count));
+  };
+  keep(larger.levels, levels, 1), keep(larger.codes, codes, 1), keep(larger.missing, missing, 1);
+  keep(larger.has_view, has_view, 1), keep(larger.mean, mean, NUMBERS), keep(larger.scale, scale, NUMBERS);
+  keep(larger.multiplier, multiplier, NUMBERS), keep(larger.index, index, NUMBERS);
+  larger.count = count;
+  *this = static_cast<Splats&&>(larger);
+}
+
 void decode_wisp(Container& file) {
-  const ExactTables tables = exact_tables();
+  auto& tables = *new ExactTables(exact_tables());  // all of it stays as long as the instance
   const Json* stated = list(file, "tables", 2, 2)->first;
   tables.check(within(stated, UINT32_MAX, "tables"), within(stated->next, UINT32_MAX, "tables"));
   Appearance looks{};
@@ -426,7 +479,7 @@ void decode_wisp(Container& file) {
   const bool by_pyramid = kind != nullptr && kind->is("pyramid");
   if (kind == nullptr || !(by_pyramid || kind->is("none"))) refuse("header value 'context' must be one of none, pyramid");
   const Order order = order_of(file, looks.planes);
-  const int64_t packets = check_sections(file, order);
+  check_sections(file, order);
   take_numbers(file, "low", 3, looks.low);
   take_numbers(file, "base_steps", NUMBERS, looks.base_steps);
   for (const double step : looks.base_steps)
@@ -443,9 +496,7 @@ void decode_wisp(Container& file) {
       shapes[layer][at] = within(each, at < 2 ? WIDEST : 1, "appearance");
   }
   looks.sh_degree = file.integer("sh_degree", 0, 3);
-  int64_t rows = 0;
-  for (int64_t i = 0; i < packets; ++i) rows += order.packets[i].kind == BASE_KIND ? order.packets[i].rows : 0;
-  file.allow(BYTES_OF_A_ROW * rows, rows);
+  rows_there(file, order);
 
   Bytes data = file.section("networks");
   Context* context;
@@ -460,22 +511,10 @@ void decode_wisp(Container& file) {
     for (int i = 0; i < 3; ++i) layers[i]->read(data, shapes[i][0], shapes[i][1], shapes[i][2] == 1);
     data.finish();
   }
-  auto& walk = *new Walk{*context, tables, static_cast<Buffer<int32_t>&&>(zeros), Splats(rows), looks.planes};
-  std::memset(walk.splats.missing.data, static_cast<int>(looks.planes), static_cast<size_t>(rows));
-  for (int64_t i = 0; i < packets; ++i) {
-    const Bytes content = file.section(section_of(i));
-    char name[16];
-    std::strcpy(name, section_of(i));
-    const Blame blame(name);
-    walk.packet(order.packets[i], content);
-  }
-  walk.finish();
-  context->forget();
-  {
-    const Blame blame("networks");
-    put_gaussians(walk.splats, looks, tables);
-  }
-  hashed = &walk.splats;
+  coded = new Coded{static_cast<Appearance&&>(looks), order, *context,
+                    {*context, tables, static_cast<Buffer<int32_t>&&>(zeros), Splats(0), looks.planes}};
+  coded->go_on(file);
+  go_on = [](Container& more) { coded->go_on(more); };
   hash_of_integers = put_integers;
 }
 

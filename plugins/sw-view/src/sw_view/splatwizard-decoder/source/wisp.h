@@ -37,6 +37,7 @@ struct Splats {
   Buffer<uint8_t> has_view;
 
   explicit Splats(int64_t rows);
+  void make_room(int64_t rows);
   int64_t unit(int64_t row, int64_t column) const {
     const int64_t at = NUMBERS * row + column;
     return mean[at] + int64_t{index[at]} * multiplier[at];

@@ -232,6 +232,7 @@ void put_gaussians(const Splats& splats, const Appearance& looks, const ExactTab
       last.outputs != outputs || last.inputs != hidden.outputs)
     refuse("no appearance network has layers (", basis.outputs, ", ", basis.inputs, "), (", hidden.outputs, ", ",
            hidden.inputs, "), (", last.outputs, ", ", last.inputs, ")");
+  decoded.clear();  // of the packets before
   const Gaussians to(splats.count, looks.sh_degree, 3);
   Painter painter(splats, looks, tables, to);
   constexpr int64_t SOME = 256;
