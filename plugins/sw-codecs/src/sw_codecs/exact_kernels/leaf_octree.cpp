@@ -51,6 +51,33 @@ void known_children(const Nodes& nodes, const int64_t* cells, const int64_t* cou
   }
 }
 
+// Whether there is something in this child of some nodes.
+[[gnu::noinline]] void fill_child(const Nodes& nodes, const uint8_t* classes, int64_t level, int child, int64_t begin,
+                                  int64_t end, Level& bits, uint8_t* occupied) {
+  const int far = __builtin_popcount(static_cast<unsigned>(child));
+  const int32_t* beside[3];
+  for (int axis = 0; axis < 3; ++axis) beside[axis] = nodes.beside[2 * axis + (child >> axis & 1)].data();
+  for (int64_t i = begin; i < end; ++i) {
+    const unsigned own = occupied[i];
+    if (child == 7 && level > LOWEST && own == 0) {
+      occupied[i] = 1 << 7;
+      continue;
+    }
+    int known = 0, near = 0;
+    for (int axis = 0; axis < 3; ++axis) {
+      const int sibling = child ^ 1 << axis;
+      const int32_t at = beside[axis][i];
+      if (child >> axis & 1)
+        known += static_cast<int>(own >> sibling & 1) + (at < 0 ? 0 : occupied[at] >> sibling & 1);
+      else
+        near += at >= 0;
+    }
+    const int64_t context =
+        CHILDREN * classes[8 * i + child] + FIRST[far] + 2 * (known * (4 - far) + near) + (own != 0);
+    occupied[i] = static_cast<uint8_t>(own | static_cast<unsigned>(bits.bit(context)) << child);
+  }
+}
+
 }  // namespace
 
 int32_t decode_leaf_octree(const RangeSession& session, const LeafOctreeArgs& a, int64_t* levels, int64_t* codes) {
@@ -71,26 +98,9 @@ int32_t decode_leaf_octree(const RangeSession& session, const LeafOctreeArgs& a,
     known_children(nodes, a.known_cells + start[0], a.known_counts + start[0], start[1] - start[0], classes);
     occupied.assign(static_cast<size_t>(size), 0);
     for (int child = 0; child < 8; ++child) {
-      const int far = __builtin_popcount(static_cast<unsigned>(child));
-      for (int64_t i = 0; i < size; ++i) {
-        uint8_t& own = occupied[static_cast<size_t>(i)];
-        if (child == 7 && level > LOWEST && own == 0) {
-          own = 1 << 7;
-          continue;
-        }
-        int known = 0, near = 0;
-        for (int axis = 0; axis < 3; ++axis) {
-          const int side = child >> axis & 1, sibling = child ^ 1 << axis;
-          const int32_t beside = nodes.beside[2 * axis + side][static_cast<size_t>(i)];
-          if (side)
-            known += (own >> sibling & 1) + (beside < 0 ? 0 : occupied[static_cast<size_t>(beside)] >> sibling & 1);
-          else
-            near += beside >= 0;
-        }
-        const int64_t context = CHILDREN * classes[static_cast<size_t>(8 * i + child)] + FIRST[far] +
-                                2 * (known * (4 - far) + near) + (own != 0);
-        own = static_cast<uint8_t>(own | bits.bit(context) << child);
-      }
+      constexpr int64_t SOME = 1 << 12;  // a call: WebAssembly takes better code for a function at its next call
+      for (int64_t i = 0; i < size; i += SOME)
+        fill_child(nodes, classes.data(), level, child, i, i + SOME < size ? i + SOME : size, bits, occupied.data());
       if (bits.damaged) return WORDS_LEFT;
     }
     std::vector<int64_t> children;  // 8 node + child

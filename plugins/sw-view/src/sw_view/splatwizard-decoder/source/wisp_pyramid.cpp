@@ -57,7 +57,7 @@ struct Pyramid final : Context {
   Buffer<int64_t> fine_codes, leaf, keys, parent, depth;
   Sums base{BASE_WIDTH}, view{VIEW_WIDTH};
   Buffer<bool> needed;
-  Buffer<double> means;
+  Buffer<int32_t> means;
 
   explicit Pyramid(const ExactTables& exact) : tables(exact) {}
 
@@ -94,7 +94,7 @@ struct Pyramid final : Context {
           for (int64_t c = 0; c < part->width; ++c)
             part->sums[part->width * at + c] += double{part->own[part->width * i + c]};
     }
-    means = Buffer<double>(MEANS * cells);
+    means = Buffer<int32_t>(MEANS * cells);
     needed = Buffer<bool>(cells);
     splats_known = n;
   }
@@ -171,7 +171,7 @@ struct Pyramid final : Context {
     call.levels = splats.levels.data, call.leaf = leaf.data, call.parent = parent.data, call.depth = depth.data;
     call.starts = starts, call.base_prior = priors, call.view_prior = priors + 2 * BASE.width();
     call.base_sums = base.at_hand(), call.view_sums = view.at_hand();
-    call.needed = needed.data, call.means = means.data;
+    call.needed = needed.data;
     return call;
   }
 
@@ -189,7 +189,7 @@ struct Pyramid final : Context {
     if (splats_known < splats.count) announce(splats);
     Buffer<int64_t> number(rows.count);
     for (int64_t i = 0; i < rows.count; ++i) number[i] = rows[i];
-    arch_native::pyramid_means(call_of(number.data, rows.count, splats), ALONE);
+    arch_native::pyramid_means(call_of(number.data, rows.count, splats), means.data);
   }
 
   void predict(int block, Rows rows, const Splats& splats, Prediction& to) override {
@@ -199,7 +199,7 @@ struct Pyramid final : Context {
     const auto inputs = [&](int64_t start, int64_t n, arch_native::Rows& in) {
       int64_t number[arch_native::BLOCK];
       for (int64_t r = 0; r < n; ++r) number[r] = rows[start + r];
-      arch_native::pyramid_seen(call, number, n, in.stride, in.value.data);
+      arch_native::pyramid_seen(call, means.data, number, n, in.stride, in.value.data);
       for (int64_t r = 0; r < n; ++r) {
         int32_t* seen = in.value.data + in.stride * r;
         std::memcpy(own + width * r, seen + known, sizeof(int32_t) * static_cast<size_t>(width));
