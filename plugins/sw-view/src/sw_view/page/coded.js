@@ -37,7 +37,7 @@ function forGpu(arrays, facts) {
   const texels = Math.ceil(coefficients / 16), harmonics = new Uint8Array(16 * texels * n);
   const means = new Float32Array(3 * n), words = new Uint32Array(8 * n), floats = new Float32Array(words.buffer);
   const [low, step] = facts.scales, [dark, tint] = facts.colors, { data: rest } = sh_rest;
-  const within = (x, least, most) => Math.min(most, Math.max(least, x));
+  const within = (x, least, most) => (x < least ? least : x > most ? most : x);
   const steps = Float64Array.from({ length: coefficients }, (_, k) => facts.bands[Math.floor(Math.sqrt(1 + Math.floor(k / 3))) - 1]);
   for (let to = 0; to < n; to++) {
     const i = rows[to];
@@ -50,8 +50,8 @@ function forGpu(arrays, facts) {
     }
     words[8 * to + 4] = rotationWord(quats.data, i);
     words[8 * to + 6] = Math.round(255 / (1 + Math.exp(-opacity_logits.data[i])));
-    for (let k = 0; k < coefficients; k++) {
-      harmonics[16 * texels * to + k] = within(Math.round(within(rest[stride * i + k], -BRIGHTEST, BRIGHTEST) / steps[k]) + 128, 0, 255);
+    for (let k = 0, from = stride * i, at = 16 * texels * to; k < coefficients; k++) {
+      harmonics[at + k] = within(Math.round(within(rest[from + k], -BRIGHTEST, BRIGHTEST) / steps[k]) + 128, 0, 255);
     }
   }
   return { means, words, harmonics: new Uint32Array(harmonics.buffer), texels };

@@ -40,6 +40,7 @@ struct Gaussians {
   float *means, *log_scales, *quats, *opacity_logits, *sh_dc, *sh_rest;
   int64_t count, rest;
 
+  Gaussians() = default;
   Gaussians(int64_t gaussians, int64_t sh_degree, int64_t scales);
 
   // Goes on behind so many Gaussians.

@@ -415,9 +415,11 @@ struct Coded {
     const int64_t packets = check_sections(file, order);
     file.section("networks");  // read before
     walk.splats.make_room(rows_there(file, order));
+    bool has_base = done > 0;
     for (int64_t i = 0; i < packets; ++i) {
       const Bytes content = file.section(section_of(i));
       if (i < done) continue;
+      has_base &= order.packets[i].kind == VIEW_KIND;
       char name[16];
       std::strcpy(name, section_of(i));
       const Blame blame(name);
@@ -427,7 +429,7 @@ struct Coded {
     walk.finish();
     if (!file.is_first_part) context.forget();
     const Blame blame("networks");
-    put_gaussians(walk.splats, looks, walk.tables);
+    put_gaussians(walk.splats, looks, walk.tables, has_base);
   }
 };
 

@@ -91,6 +91,7 @@ struct Appearance {
   EightBitLayer basis, hidden, last;
 };
 
-void put_gaussians(const Splats& splats, const Appearance& looks, const ExactTables& tables);
+// `has_base`: Gaussians of the same base were put before, and get their new harmonics.
+void put_gaussians(const Splats& splats, const Appearance& looks, const ExactTables& tables, bool has_base);
 
 }  // namespace swz

@@ -10,6 +10,7 @@ namespace {
 
 constexpr double C0 = 0.28209479177387814, ROOT_2 = 1.4142135623730951, ROOT_6 = 2.449489742783178;
 constexpr double HALF_PI = 1.5707963267948966, SMALLEST = 2.2250738585072014e-308;
+constexpr double NO_ANGLE = 1e-18;  // radians that turn no float64
 constexpr int64_t COLOURS = 3, SWEEPS = 5;
 
 int group_of(int64_t column) { return column < 1 ? 0 : column < 6 ? 1 : column < 7 ? 2 : column < 10 ? 3 : 4; }
@@ -66,6 +67,7 @@ void diagonalise(double m[3][3], double vectors[3][3]) {
     for (const int r : {2, 1, 0}) {
       const int p = r == 0 ? 1 : 0, q = r == 2 ? 1 : 2;
       const double twice = 2 * m[p][q], apart = m[q][q] - m[p][p];
+      if (std::fabs(twice) <= NO_ANGLE * std::fabs(apart)) continue;  // mostly from the third sweep on
       const double t = twice / (apart + std::copysign(std::sqrt(apart * apart + twice * twice) + SMALLEST, apart));
       const double c = 1 / std::sqrt(1 + t * t), s = t * c, shift = t * m[p][q];
       m[p][p] -= shift, m[q][q] += shift;
@@ -180,11 +182,11 @@ struct Painter {
         last(how.last), inner(hidden.padded), rest(last.padded), log_edge(std::log(how.edge)),
         thinnest(std::log(1e-6 * how.edge)) {}
 
-  [[gnu::noinline]] void put(int64_t begin, int64_t end) {
+  [[gnu::noinline]] void put(int64_t begin, int64_t end, bool has_base) {
     for (int64_t row = begin; row < end; ++row) {
       float number[NUMBERS];
       values.put(row, number);
-      put_base(row, number);
+      if (!has_base) put_base(row, number);
       put_harmonics(row, number);
     }
   }
@@ -225,19 +227,22 @@ struct Painter {
 
 }  // namespace
 
-void put_gaussians(const Splats& splats, const Appearance& looks, const ExactTables& tables) {
+void put_gaussians(const Splats& splats, const Appearance& looks, const ExactTables& tables, bool has_base) {
   const EightBitLayer &basis = looks.basis, &hidden = looks.hidden, &last = looks.last;
   const int64_t outputs = 3 * looks.sh_degree * (looks.sh_degree + 2), latents = LATENTS.width();
   if (basis.outputs != outputs || basis.inputs != latents || hidden.inputs != latents + COLOURS ||
       last.outputs != outputs || last.inputs != hidden.outputs)
     refuse("no appearance network has layers (", basis.outputs, ", ", basis.inputs, "), (", hidden.outputs, ", ",
            hidden.inputs, "), (", last.outputs, ", ", last.inputs, ")");
-  decoded.clear();  // of the packets before
-  const Gaussians to(splats.count, looks.sh_degree, 3);
+  static Gaussians to;
+  if (!has_base) {
+    decoded.clear();  // of the packets before
+    to = Gaussians(splats.count, looks.sh_degree, 3);
+  }
   Painter painter(splats, looks, tables, to);
   constexpr int64_t SOME = 256;
   for (int64_t row = 0; row < splats.count; row += SOME)
-    painter.put(row, row + SOME < splats.count ? row + SOME : splats.count);
+    painter.put(row, row + SOME < splats.count ? row + SOME : splats.count, has_base);
   decoded.check_finite();
 }
 
