@@ -55,7 +55,7 @@ class Renderer {
 
   texture(unit, words, channels) {  // four channels or one
     const gl = this.gl, texels = Math.max(1, Math.ceil(words.length / channels));
-    const most = gl.getParameter(gl.MAX_TEXTURE_SIZE), width = Math.min(most, 2048), height = Math.ceil(texels / width);
+    const most = gl.getParameter(gl.MAX_TEXTURE_SIZE), width = 2048, height = Math.ceil(texels / width);  // as splat.vert says
     if (height > most) throw new Error('The GPU of this browser has no texture that is large enough for this scene.');
     const padded = new Uint32Array(channels * width * height);
     padded.set(words);

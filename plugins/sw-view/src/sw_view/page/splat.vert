@@ -26,14 +26,14 @@ const float LIMIT = 1.0 / 255.0;
 const int CORNERS = 4096;       // of an instance, four a Gaussian
 int row;
 
-uvec4 texel(usampler2D source, int index) {
-  int width = textureSize(source, 0).x;
-  return texelFetch(source, ivec2(index % width, index / width), 0);
+uvec4 texel(usampler2D source, int index) {  // textures are 2,048 texels wide
+  return texelFetch(source, ivec2(index & 2047, index >> 11), 0);
 }
 
+uvec4 words[3];                 // of the bands above 0
+
 float byteOf(int index) {       // one coefficient, -128..127
-  uvec4 words = texel(harmonics, row * harmonicTexels + index / 16);
-  return float(int((words[(index / 4) % 4] >> uint(8 * (index % 4))) & 255u) - 128);
+  return float(int((words[index / 16][(index / 4) % 4] >> uint(8 * (index % 4))) & 255u) - 128);
 }
 
 vec3 coefficient(int k) {       // k = 1 .. 15
@@ -43,6 +43,7 @@ vec3 coefficient(int k) {       // k = 1 .. 15
 
 vec3 colorFrom(vec3 d) {        // d: unit vector from the eye; the basis and its signs are those of 3DGS
   float x = d.x, y = d.y, z = d.z;
+  for (int i = 0; i < harmonicTexels; i++) words[i] = texel(harmonics, row * harmonicTexels + i);
   vec3 sum = 0.4886025119029199 * bandSteps.x *
       (-y * coefficient(1) + z * coefficient(2) - x * coefficient(3));
   if (degree < 2) return sum;
