@@ -102,13 +102,16 @@ from splatwizard_core.runs.run import run as run
 from splatwizard_core.runs.run import train_in as train_in
 from splatwizard_core.runs.session import Session as Session
 from splatwizard_core.runs.training import cached_directory as cached_directory
+from splatwizard_core.scene.images import keep_pictures as keep_pictures
 from splatwizard_core.scene.loading import family_of as family_of
 from splatwizard_core.scene.loading import load_scene as load_scene
 from splatwizard_core.scene.locate import DATA_VARIABLE as DATA_VARIABLE
+from splatwizard_core.streams import Streams as Streams
 from splatwizard_core.training.keys import block_keys as block_keys
 from splatwizard_core.training.params import SceneParams as SceneParams
 from splatwizard_core.training.pipeline import TrainingRun as TrainingRun
 from splatwizard_core.training.pipeline import TrainingStopped as TrainingStopped
 from splatwizard_core.training.scheduler import build_schedulers as build_schedulers
 from splatwizard_core.training.stage import PlannedTask as PlannedTask
+from splatwizard_core.training.trainer import Trainer as Trainer
 from splatwizard_native.errors import ForeseenError as ForeseenError

@@ -1,7 +1,7 @@
 """Hyper-parameters of 3DGS. Defaults are the paper's (the plan of the Splatwizard paper where they differ)."""
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 from pydantic import Field
 from sw_gaussians.choices import CodecChoice, Moved
@@ -9,11 +9,17 @@ from sw_gaussians.config import GaussianTraining
 from sw_gaussians.fast.fused_adam import MIN_FUSED_GAUSSIANS
 from sw_gaussians.sized import FILLING, Capped
 
-from splatwizard_core.api import InputFile
+from splatwizard_core.api import InputFile, SameResult
 from sw_codecs.models.settings import QuantizedSettings
 
 MODES = {"exact": "gaussians-exact", "quantized": "gaussians-quantized"}
 """Header value `mode` of a file (and `codec.mode` of 0.1 configs) -> codec."""
+
+
+VIEWS_PER_GPU = 2
+"""Views that each of several GPUs draws for an update: exchanging gradients then takes half as long per view."""
+MOST_VIEWS = 8
+"""Views in an update, at most: Adam's memory of gradients is then that of the last two."""
 
 
 class ThreeDGSConfig(Capped, GaussianTraining):
@@ -35,7 +41,24 @@ class ThreeDGSConfig(Capped, GaussianTraining):
         description="on CUDA, update spherical harmonics in the backward pass, equal but for rounding; None: from "
         f"{MIN_FUSED_GAUSSIANS:,} Gaussians on, where it is faster",
     )
+    batch: int = Field(
+        1,
+        ge=1,
+        le=MOST_VIEWS,
+        description="views whose gradients make one update; plans and steps are counted in views",
+    )
+    gpus: Annotated[int, SameResult()] = Field(
+        1,
+        ge=1,
+        le=MOST_VIEWS,
+        description="GPUs that train one model, each on its share of a batch; on a CPU: processes",
+    )
     codec: CodecChoice = Field(CodecChoice(name="gaussians-exact"), description="what writes the file")
+
+    def completed(self, plugins: Any, sources: Mapping[str, str]) -> Any:
+        """Return this with a batch for its GPUs, unless one was given."""
+        batch = self.batch if "batch" in sources or self.gpus == 1 else min(VIEWS_PER_GPU * self.gpus, MOST_VIEWS)
+        return super(ThreeDGSConfig, self.model_copy(update={"batch": batch})).completed(plugins, sources)
 
     def translated(self, values: dict[str, Any]) -> dict[str, Any]:
         if "codec.mode" in values:

@@ -14,6 +14,7 @@ from sw_gaussians.surfels import refuse_surfels
 from splatwizard_core.api import placed_in
 from sw_3dgs.config import MODES, ThreeDGSConfig
 from sw_3dgs.presets import PRESETS, RATES
+from sw_3dgs.shared_stage import shared_stage
 
 if TYPE_CHECKING:
     import torch
@@ -49,6 +50,8 @@ class ThreeDGS(GaussianMethod):
 
     def stages(self) -> Sequence[Stage]:
         config: ThreeDGSConfig = self.config
+        if config.batch > 1 or config.gpus > 1:
+            return [shared_stage(config, self.plugins)]
         control, pictures = config.density.load(self.plugins), config.pictures.load(self.plugins)
         return [ThreeDGSStage(config, control, pictures=pictures, fuses_updates=config.fused_updates)]
 

@@ -23,7 +23,7 @@ class ControlTask:
         self.do = do
 
     def __call__(self, state: TrainingState) -> None:
-        if state.step >= state.opt.iterations:
+        if state.step >= state.iterations:
             return
         for name, count in (self.do(state) or {}).items():
             state.log.scalar(name, count)

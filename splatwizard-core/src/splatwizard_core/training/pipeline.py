@@ -248,7 +248,7 @@ class TrainingRun:
         with housekeeping.guard:
             if trains:
                 try:
-                    with housekeeping.around():
+                    with state.stage.running(state), housekeeping.around():
                         trainer.run(until, housekeeping.after_step)
                 finally:
                     keep_pictures(self.scene.train, "cpu")

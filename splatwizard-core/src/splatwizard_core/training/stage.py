@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -19,6 +20,7 @@ from splatwizard_core.training.plan import When, scaled
 if TYPE_CHECKING:
     from splatwizard_core.training.optimizer import SplatOptimizer
     from splatwizard_core.training.scheduler import Scheduler
+    from splatwizard_core.training.state import TrainingState
 
 
 class CameraSampler:
@@ -96,6 +98,7 @@ class Stage:
     name        shown in plans and logs
     opt         the hyper-parameters that its tasks see as OptimizationParams; a borrowed stage brings its own
     extra_tasks tasks that the configuration puts into the plan besides the stage's own
+    views_per_step  views that a step draws, all processes together; `opt` counts its plan and its steps in views
     """
 
     name: str = "train"
@@ -104,11 +107,12 @@ class Stage:
     def __init__(self, opt: OptimizationParams) -> None:
         self.opt = opt
         self.extra_tasks = ()
+        self.views_per_step = 1
 
     @property
     def iterations(self) -> int:
         """Number of steps; s = 1 .. iterations."""
-        return self.opt.iterations
+        return -(-self.opt.iterations // self.views_per_step)
 
     @property
     def starts_from(self) -> str | None:
@@ -161,7 +165,7 @@ class Stage:
 
     def when(self, when: When) -> When:
         """Scale a plan of the full schedule to this run if `opt.scale_schedule`, else return it unchanged."""
-        return scaled(when, self.opt.schedule_scale)
+        return scaled(when, self.opt.schedule_scale / self.views_per_step)
 
     def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
         """Register a task that runs before rendering, at the steps of `self.when(plan of the full run)`."""
@@ -176,6 +180,10 @@ class Stage:
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
         """Return the loss of this step. Default: 0.8 L1 + 0.2 (1 - SSIM) against the view's picture on `background`."""
         return photometric_loss(result.image, view.image(background, result.image.device))
+
+    def running(self, state: TrainingState) -> AbstractContextManager[Any]:
+        """Enclose the loop of steps, of a new state or a resumed one; what it does around them is not training time."""
+        return nullcontext()
 
     def finish(self, model: SplatModel, scene: Scene) -> SplatModel:
         """Return the model that the next stage, or the encoder, gets; called once after the last step."""
