@@ -55,14 +55,14 @@ ROOMS = {
 
 LIBRARIES = {
     "sw_rasterizers", "sw_codecs", "sw_gaussians", "sw_anchors", "sw_reference", "sw_interchange", "sw_view",
-    "sw_report",
+    "sw_report", "sw_parallel",
 }  # fmt: skip
 """Packages that others may import when they declare them; of sw_report the format of published figures and BD-rates."""
 EXTENDS = {"sw_hac_plus": "sw_hac"}
 """Method -> the method that it builds on, and so imports."""
 ABOUT_RUNS = {
     "sw_bench", "sw_compress", "sw_datasets", "sw_doctor", "sw_geometry", "sw_interchange", "sw_kit", "sw_lod",
-    "sw_metrics", "sw_report", "sw_view",
+    "sw_metrics", "sw_parallel", "sw_report", "sw_view",
 }  # fmt: skip
 """Packages that may use `tooling` besides `api`."""
 

@@ -3,17 +3,19 @@
 import functools
 import io
 import json
+import multiprocessing
 import subprocess
+import threading
 from types import SimpleNamespace
 
 import pytest
 import torch
 from forked_children import start_python
 from sw_gaussians.stage import ThreeDGSStage
-from sw_parallel.followers import Job, followed
+from sw_parallel.followers import Job, followed, wait_for
 from sw_parallel.ranks import Ranks
 
-from splatwizard_core.errors import CapabilityError, ConfigError
+from splatwizard_core.errors import CapabilityError, ConfigError, SplatwizardError
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.runs.config import resolve
@@ -22,6 +24,7 @@ from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.streams import Streams
 from splatwizard_core.training.identity import given_values
 from splatwizard_core.training.params import PipelineParams
+from splatwizard_core.training.pipeline import TrainingRun
 from splatwizard_core.training.scheduler import build_schedulers, format_plan
 from splatwizard_core.training.stage import StageContext
 from splatwizard_core.training.state import TrainingState
@@ -45,6 +48,7 @@ from splatwizard_core.scene.dataset import SceneOptions
 from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.streams import Streams
 from splatwizard_core.training.params import PipelineParams
+from splatwizard_core.training.pipeline import TrainingRun
 from splatwizard_core.training.stage import StageContext
 from splatwizard_core.training.state import TrainingState
 from splatwizard_core.training.trainer import Trainer
@@ -52,15 +56,17 @@ from sw_3dgs.method import ThreeDGS
 from sw_3dgs.shared_stage import shared_stage
 from sw_parallel.ranks import Ranks, joined
 
-sets, rank, count, steps, out = json.loads(sys.argv[1])
+sets, rank, count, steps, device, out = json.loads(sys.argv[1])
 torch.set_num_threads(1)
+if device == "cuda":
+    torch.cuda.set_device(rank)
 plugins = load_plugins()
 config = resolve(ThreeDGS, "paper", sets=sets, plugins=plugins).config
 scene = load_scene("demo:tiny", SceneOptions(init_points=600), plugins)
 ranks, ppl, streams = Ranks(rank, count), PipelineParams(), Streams(0)
 stage = shared_stage(config, plugins, ranks)
-rasterizer = NegotiatedRasterizer(plugins, device="cpu")
-model = ThreeDGS(plugins, config).create_model(scene, streams("init"))
+rasterizer = NegotiatedRasterizer(plugins, device=device)
+model = ThreeDGS(plugins, config).create_model(scene, streams("init")).to(device)
 model = stage.begin(StageContext(model, scene, ppl, rasterizer, streams, None))
 trainer = Trainer(TrainingState.begin(stage, model, scene, ppl, rasterizer, streams))
 digests, views = [], []
@@ -68,7 +74,7 @@ digests, views = [], []
 def look(state):
     moments = [t for each in state.optimizer.states.values() for t in each.tensors.values()]
     tensors = [*state.model.parameters(), *moments, state.sampler.generator.get_state()]
-    digests.append(hashlib.sha256(b"".join(t.detach().numpy().tobytes() for t in tensors)).hexdigest())
+    digests.append(hashlib.sha256(b"".join(t.detach().cpu().numpy().tobytes() for t in tensors)).hexdigest())
     views.append(state.view)
 
 def go():
@@ -77,24 +83,20 @@ def go():
     print(json.dumps({"digests": digests, "views": views, "rows": trainer.state.num_rows}))
 
 if count > 1:
-    with joined(ranks, torch.device("cpu"), Path(out, "meeting")):
+    with joined(ranks, torch.device(device), Path(out, "meeting")):
         go()
 else:
     go()
 """
 
 
-def train(folder, *, count: int, steps: int, **sets):
+def train(folder, *, count: int, steps: int, device: str = "cpu", **sets):
     """Train in `count` processes that were forked; what each printed, and the model of each."""
     folder.mkdir()
-    children = [
-        start_python(
-            "-c", TRAIN, json.dumps([sets, rank, count, steps, str(folder)]), stdout=subprocess.PIPE, text=True
-        )
-        for rank in range(count)
-    ]
+    given = [json.dumps([sets, rank, count, steps, device, str(folder)]) for rank in range(count)]
+    children = [start_python("-c", TRAIN, each, stdout=subprocess.PIPE, text=True) for each in given]
     told = [json.loads(child.communicate(timeout=300)[0]) for child in children]
-    return told, [torch.load(folder / f"{rank}.pt", weights_only=True) for rank in range(count)]
+    return told, [torch.load(folder / f"{rank}.pt", map_location="cpu", weights_only=True) for rank in range(count)]
 
 
 @pytest.fixture(scope="module")
@@ -107,8 +109,15 @@ def scene():
     return load_scene("demo:tiny", SceneOptions(init_points=300), load_plugins())
 
 
-def test_processes_stay_equal_in_every_bit_through_densification_and_reset(folder):
-    (first, second), models = train(folder / "equal", count=2, steps=STEPS, gpus=2, batch=2, iterations=400, **PLAN)
+on_two_gpus = pytest.param(
+    "cuda", marks=[pytest.mark.cuda, pytest.mark.skipif(torch.cuda.device_count() < 2, reason="no two GPUs")]
+)
+
+
+@pytest.mark.parametrize("device", ["cpu", on_two_gpus])
+def test_processes_stay_equal_in_every_bit_through_densification_and_reset(folder, device):
+    sets = {"gpus": 2, "batch": 2, "iterations": 400, **PLAN}
+    (first, second), models = train(folder / f"equal-{device}", count=2, steps=STEPS, device=device, **sets)
     assert first["digests"] == second["digests"]
     assert len(set(first["digests"])) == STEPS
     assert not set(first["views"][:3]) & set(second["views"][:3])  # one draw of all views goes to both
@@ -202,3 +211,22 @@ def test_more_gpus_than_there_are_are_refused(monkeypatch):
     state = SimpleNamespace(device=torch.device("cuda"))
     with pytest.raises(CapabilityError, match="gpus=2: torch sees 1 CUDA device here"), followed(state, None, 2):
         pass
+
+
+def test_a_process_that_does_not_come_up_is_told():
+    ended = SimpleNamespace(exitcode=1)
+    with pytest.raises(SplatwizardError, match="ended before the first step"):
+        wait_for([ended], threading.Semaphore(0))
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="no two GPUs")
+def test_a_run_on_two_gpus_ends_with_the_processes_that_it_started(scene, tmp_path):
+    plugins, config = load_plugins(), config_of(gpus=2, iterations=200, **PLAN)
+    method = ThreeDGS(plugins, config)
+    outcome = TrainingRun(
+        method.stages(), lambda: method.create_model(scene, torch.Generator()).cuda(), scene, PipelineParams(),
+        NegotiatedRasterizer(plugins, device="cuda"), directory=tmp_path, identity={}, trained=pytest.fail,
+    ).train()  # fmt: skip
+    assert (outcome.figures.steps, multiprocessing.active_children()) == (100, [])
+    assert outcome.model.num_rows > 300

@@ -119,7 +119,7 @@ def followed(state: TrainingState, make_stage: MakeStage, count: int) -> Iterato
         try:
             for process in others:
                 process.start()
-            _wait_for(others, ready)
+            wait_for(others, ready)
             with joined(Ranks(0, count), state.device, meeting) as ranks, _watched(others):
                 yield ranks
         finally:
@@ -154,7 +154,7 @@ def _end_with_parent() -> None:
     os._exit(1)  # the main thread may wait in a call of a library
 
 
-def _wait_for(others: Sequence[SpawnProcess], ready: Semaphore) -> None:
+def wait_for(others: Sequence[SpawnProcess], ready: Semaphore) -> None:
     """Return when all are ready. Raises SplatwizardError if one ends before."""
     for _ in others:
         while not ready.acquire(timeout=0.1):

@@ -50,7 +50,7 @@ class Ranks:
             group.allreduce_coalesced(list(tensors), options).wait()
         except RuntimeError as error:
             raise SplatwizardError(
-                f"process {self.rank} of {self.count} of this training lost the others: {error}"
+                f"process {self.rank} of {self.count} of this training has lost another one, which tells why above"
             ) from error
 
 
