@@ -3,40 +3,52 @@
     python benchmarks/several_gpus.py DATA/room DATA/fox:images_2 --gpus 2 --batches 2,4 --out out/gpus.jsonl
 
 A scene is FOLDER[:PICTURES], FAMILY:FOLDER[:PICTURES] or demo; the plan is that of preset `paper`, whole or scaled by
---iterations (views, of all GPUs together). Seconds are those of the training loop; starting the other processes is not
-part of them, but of `wall`, as is reading pictures. PSNR and SSIM are means over the held-out views. The last column is
-how many times as fast as on one GPU a training is, and its distance in PSNR.
+--iterations (views, of all GPUs together). Seconds are those of the training loop: starting the other processes is not
+part of them, nor is reading pictures. PSNR and SSIM are means over the held-out views. The table at the end says how
+many times as fast as on one GPU a training is, and how far from it in PSNR; means over the seeds that each has.
+
+--alone     also batches on one GPU
+--out FILE  a line of JSON a training; what stands there is not trained again
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import time
+import statistics
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from scene_names import FORMS
-from time_to_quality import Job, Variant, trained
+from time_to_quality import Job, Variant, run
+
+ONE = Variant("1 GPU", "paper")
 
 
-def variants_of(gpus: int, batches: list[int], alone: list[int]) -> list[Variant]:
-    """Return how each scene is trained: as published first, then in batches on one GPU, then on several."""
-    return [
-        Variant("1 GPU", "paper"),
-        *(Variant(f"1 GPU, batch {each}", "paper", {"batch": each}) for each in alone),
-        *(Variant(f"{gpus} GPUs, batch {each}", "paper", {"gpus": gpus, "batch": each}) for each in batches),
-    ]
+def table(lines: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Yield the rows of each scene, one for each variant."""
+    for scene in dict.fromkeys(line["job"]["scene"] for line in lines):
+        yield f"\n{scene}"
+        groups: dict[str, list[Mapping[str, Any]]] = {}
+        for line in lines:
+            if line["job"]["scene"] == scene:
+                groups.setdefault(line["job"]["variant"]["name"], []).append(line)
+        one = groups.get(ONE.name)
+        for name, group in groups.items():
+            seconds, psnr, ssim, rows = (mean(group, key) for key in ("seconds", "psnr", "ssim", "gaussians"))
+            compared = ""
+            if one is not None:
+                times = mean(one, "seconds") / seconds
+                compared = f"  {times:.2f} times as fast, {psnr - mean(one, 'psnr'):+.2f} dB"
+            yield (
+                f"  {name:18} {len(group)} seeds {group[0]['steps']:7,} steps {seconds:7.1f} s {psnr:6.2f} dB "
+                f"{ssim:.4f} {rows:9,.0f} Gaussians {mean(group, 'peak_mib'):6.0f} MiB{compared}"
+            )
 
 
-def row(name: str, found: dict[str, Any], first: dict[str, Any]) -> str:
-    """Return the line of a training; `first`: that of one GPU."""
-    return (
-        f"  {name:18} {found['steps']:7,} steps {found['seconds']:7.1f} s (wall {found['wall']:.0f}) "
-        f"{found['psnr']:6.2f} dB {found['ssim']:.4f} {found['gaussians']:9,} Gaussians {found['peak_mib']:6.0f} MiB  "
-        f"{first['seconds'] / found['seconds']:.2f} times as fast, {found['psnr'] - first['psnr']:+.2f} dB"
-    )
+def mean(group: Sequence[Mapping[str, Any]], key: str) -> float:
+    return statistics.fmean(line[key] for line in group)
 
 
 def main() -> None:
@@ -46,26 +58,22 @@ def main() -> None:
     parser.add_argument("--batches", default="4", help="views in an update there, comma list (default: 4)")
     parser.add_argument("--alone", default="", help="also batches on one GPU, comma list")
     parser.add_argument("--seeds", default="0", help="comma list (default: 0)")
+    parser.add_argument("--one-seeds", help="of the trainings on one GPU (default: the same)")
     parser.add_argument("--iterations", type=int, help="scale the plan to so many views (default: 30,000)")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="append a line of JSON for each training")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="lines of JSON, which a second call goes on from")
     args = parser.parse_args()
-    batches, alone = ([int(each) for each in text.split(",") if each] for text in (args.batches, args.alone))
-    for scene in args.scenes:
-        for seed in map(int, args.seeds.split(",")):
-            print(f"{scene}, seed {seed}", flush=True)
-            first: dict[str, Any] | None = None
-            for variant in variants_of(args.gpus, batches, alone):
-                began = time.monotonic()
-                found = trained(Job(scene, variant, seed, args.device, 0, args.iterations, 0))
-                found["wall"] = time.monotonic() - began
-                first = first or found
-                print(row(variant.name, found, first), flush=True)
-                if args.out is not None:
-                    args.out.parent.mkdir(parents=True, exist_ok=True)
-                    with args.out.open("a", encoding="utf-8") as file:
-                        told = {"scene": scene, "seed": seed, "variant": variant.name, **variant.sets}
-                        file.write(json.dumps({**told, **found, "growth": None}) + "\n")
+    alone, batches = ([int(each) for each in text.split(",") if each] for text in (args.alone, args.batches))
+    one = [ONE, *(Variant(f"1 GPU, batch {each}", "paper", {"batch": each}) for each in alone)]
+    several = [Variant(f"{args.gpus} GPUs, batch {n}", "paper", {"gpus": args.gpus, "batch": n}) for n in batches]
+    jobs = [
+        Job(scene, variant, int(seed), args.device, 0, args.iterations, 0)
+        for scene in args.scenes
+        for variants, seeds in ((one, args.one_seeds or args.seeds), (several, args.seeds))
+        for seed in seeds.split(",")
+        for variant in variants
+    ]
+    print("\n".join(table(run(jobs, args.out, 1))))
 
 
 if __name__ == "__main__":
