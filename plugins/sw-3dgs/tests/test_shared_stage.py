@@ -12,6 +12,7 @@ import pytest
 import torch
 from forked_children import start_python
 from sw_gaussians.stage import ThreeDGSStage
+from sw_gaussians.wrapped_stage import WrappedStage
 from sw_parallel.followers import Job, followed, wait_for
 from sw_parallel.ranks import Ranks
 
@@ -26,7 +27,7 @@ from splatwizard_core.training.identity import given_values
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.pipeline import TrainingRun
 from splatwizard_core.training.scheduler import build_schedulers, format_plan
-from splatwizard_core.training.stage import StageContext
+from splatwizard_core.training.stage import PlannedTask, StageContext
 from splatwizard_core.training.state import TrainingState
 from splatwizard_core.training.trainer import Trainer
 from sw_3dgs.method import ThreeDGS
@@ -211,6 +212,15 @@ def test_more_gpus_than_there_are_are_refused(monkeypatch):
     state = SimpleNamespace(device=torch.device("cuda"))
     with pytest.raises(CapabilityError, match="gpus=2: torch sees 1 CUDA device here"), followed(state, None, 2):
         pass
+
+
+def test_what_wraps_the_stage_or_adds_tasks_cannot_share_it():
+    stage = stage_of(gpus=2)
+    with pytest.raises(ConfigError, match="gpus=2 is for the plan of 3dgs alone"):
+        WrappedStage(stage).running(SimpleNamespace(stage=None)).__enter__()
+    stage.extra_tasks = (PlannedTask(False, 1, print),)
+    with pytest.raises(ConfigError, match="gpus=2"):
+        stage.running(SimpleNamespace(stage=stage)).__enter__()
 
 
 def test_a_process_that_does_not_come_up_is_told():

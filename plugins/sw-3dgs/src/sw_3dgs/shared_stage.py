@@ -88,8 +88,12 @@ class SharedStage(ThreeDGSStage):
         if self.views_per_step == 1:
             yield
             return
-        if self.extra_tasks:
-            raise ConfigError("gpus: tasks that a configuration adds do not reach the other processes: leave out one")
+        if state.stage is not self or self.extra_tasks:
+            raise ConfigError(
+                f"gpus={self.views_per_step} is for the plan of 3dgs alone: what a method or a configuration adds to it "
+                "does not reach the other processes. Leave it out; a scene to start from takes pretrained.gpus",
+                key="gpus",
+            )
         make_stage = functools.partial(shared_stage, self._given)
         with followed(state, make_stage, self.views_per_step) as self.ranks:
             assert isinstance(state.optimizer, SummingAdam)
