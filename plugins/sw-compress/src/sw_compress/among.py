@@ -64,7 +64,7 @@ def coarse(model: GaussianModel, rows: Tensor) -> GaussianModel:
         grouped = Splats(*(values.view(-1, MEMBERS, *values.shape[1:]) for values in groups))
         found.append(merge_groups(grouped, rule="mass", widen=True).to(torch.float32))
     all_of = Splats(*(torch.cat(each) for each in zip(*found, strict=True)))
-    return model_of(all_of, model)
+    return model_of(all_of, torch.arange(len(all_of.means), device=all_of.means.device), model)
 
 
 def without(count: int, rows: Tensor) -> Tensor:
