@@ -31,6 +31,24 @@ def test_rows_fill_a_size_in_few_files(share: float, fixed: int):
     assert files <= 4
 
 
+def test_a_jump_of_the_bytes_ends_the_search_before_it():
+    def written(rows: int) -> int:
+        asked.append(rows)
+        return 30 * rows + (10_000 if rows >= 2048 else 0)
+
+    asked: list[int] = []
+    assert 2000 < rows_that_fit(3000, 100_000, 66_000, written) < 2048
+    assert len(asked) <= 6
+
+
+@pytest.mark.pipeline
+def test_a_palette_between_those_of_sog_fills_what_numbers_of_gaussians_leave(ball, tmp_path: Path):
+    """With 2,048 Gaussians its palette is twice as large as with one less: 60,036 and 66,339 bytes."""
+    out, method = tmp_path / "a.swz", create_method(load_plugins(), "sog", {"size": "63kB"})
+    encode(method, ball(2060, degree=1), {}, out)
+    assert 0.97 * 63_000 < out.stat().st_size <= 63_000
+
+
 def test_no_row_fits_below_what_is_fixed():
     assert tried(10_000, 29_000, 40.0, 30_000)[0] == 0
 
@@ -56,6 +74,14 @@ def test_settings_lie_between_rate_points_and_go_on_where_there_is_no_between():
     assert steps[0] > steps[1] > steps[2] > steps[3] > steps[4]
     assert steps[1] == pytest.approx((steps[0] * steps[2]) ** 0.5)
     assert ladder.at(-1.0).codec.settings["dc_step"] > ladder.at(0.0).codec.settings["dc_step"]
+
+
+def test_grades_are_for_settings_that_are_no_numbers():
+    ladder = RateLadder(create_method(load_plugins(), "sog"))
+    assert [ladder.graded(share).codec.settings["palette"] for share in (0.0, 1.0)] == [256, 65_536]
+    assert ladder.points[ladder.own].codec.settings["palette"] is None
+    for other in ("spz", "2dgs"):
+        assert RateLadder(create_method(load_plugins(), other)).graded(0.5) is None
 
 
 def test_settings_of_the_user_are_no_rate_point():

@@ -168,7 +168,11 @@ class SizeFilling:
         return place
 
     def _by_rows(self, whole: Tried) -> Tried | None:
-        """Return a file with fewer rows; None if one row is too much."""
+        """Return a file with fewer rows; None if one row is too much.
+
+        Where a number of rows more does not fit, since settings follow that number, settings between the rate points
+        fill what is left.
+        """
         order, tried = self._rows_by_worth(), dict[int, Tried]()
 
         def written(rows: int) -> int:
@@ -176,7 +180,28 @@ class SizeFilling:
             self.least = min(self.least, tried[rows].bytes)
             return tried[rows].bytes
 
-        return tried.get(rows_that_fit(self.model.num_rows, whole.bytes, self.size, written))
+        found = tried.get(rows_that_fit(self.model.num_rows, whole.bytes, self.size, written))
+        if found is None or self._fills(found):
+            return found
+        rows = min((rows for rows, each in tried.items() if each.bytes > self.size), default=self.model.num_rows)
+        return max([found, *self._by_grades(rows)], key=lambda each: each.bytes)
+
+    def _by_grades(self, rows: int) -> list[Tried]:
+        """Files that fit, with so many rows and settings from those of the first rate point to those of the last."""
+        model, low, high = with_rows(self.model, self._rows_by_worth()(rows)), 0.0, 1.0
+        found = list[Tried]()
+        for _ in range(TRIES):
+            middle = (low * high) ** 0.5 if low else high / 8  # palettes and the like double, and double again
+            if (config := self.ladder.graded(middle)) is None:
+                break
+            each = self._try(config, model, rows)
+            if each.bytes > self.size:
+                high = middle
+                continue
+            low, found = middle, [*found, each]
+            if self._fills(each):
+                break
+        return found
 
     def _rows_by_worth(self) -> Callable[[int], Tensor]:
         if self._order is None:
@@ -206,6 +231,8 @@ def rows_that_fit(count: int, whole: int, size: int, written: Callable[[int], in
             under = found
             if found[1] >= FILLED * size:
                 break
+        if under[0] and (over[0] - 1 - under[0]) * under[1] / under[0] < FILLED * size - under[1]:
+            break  # sizes jump there: no number between fills it
         start = under if under[0] else (0, fixed)
         slope = (over[1] - start[1]) / (over[0] - start[0])
         wanted = start[0] + (GOAL * size - start[1]) / max(slope, 1e-9)

@@ -53,6 +53,18 @@ class RateLadder:
                 return moved.completed(self.plugins, {})
         return None
 
+    def graded(self, share: float) -> OptimizationParams | None:
+        """Return the config at a share, 0..1, between the first and the last rate point where the present one is not of
+        numbers as they are: None in .sog's, a palette by the number of Gaussians. None for any other."""
+        present = self.points[self.own]
+        if any(between(present, other, 0.5) is not None for other in self.points):
+            return None
+        found = between(self.points[0], self.points[-1], share)
+        if found is None:
+            return None
+        moved: OptimizationParams = apply_overrides(self.config, found, source="settings for a size")
+        return moved.completed(self.plugins, {})
+
     def _sharing(self, method: Method) -> tuple[list[OptimizationParams], int]:
         """Return configs of the rate points that differ from the present one in what `encode` reads, and its place."""
         values = {name: dict(self.config.spelled(method.RATES[name])) for name in method.RATES}
