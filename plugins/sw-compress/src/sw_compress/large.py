@@ -37,6 +37,7 @@ from sw_compress.reducing import Reduction
 from sw_compress.rows import IMPORTANCE, like, select, with_degree
 from sw_compress.search import Choice, Search, for_quality, for_size, least_bytes, too_small
 from sw_compress.shelf import Shelf
+from sw_compress.stages import Stages, give_back
 from sw_compress.targets import LEAST_SHARE, QUALITY_MARGIN, Target
 from sw_compress.tiled_file import TiledFile, tiles_of
 from sw_compress.views import Views, made_up_views
@@ -45,7 +46,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from splatwizard_core.api import PluginManager, Rasterizer
-    from sw_compress.stages import Stages
 
 LARGE = {"cpu": 4_000_000, "cuda": 16_000_000}
 """Gaussians above which a file is made small in two passes, by kind of device."""
@@ -53,7 +53,7 @@ LEAST_ROW = 56
 """Bytes of a Gaussian in a .ply, at least."""
 SAMPLE, RUN = 1 << 18, 1 << 12
 """Gaussians that are searched with, and how many of them lie side by side."""
-QUALITY_TRIES = 4
+QUALITY_TRIES = 6
 """Files that are written for a quality; each is decoded and drawn."""
 
 
@@ -253,23 +253,30 @@ class _Work:
             choice = for_quality(sample.search, quality - 10 * math.log10(sample.share), exact)
         file = self._reduced(choice)
         best: tuple[int, Choice] | None = None
-        known: list[tuple[float, float]] = []  # decibels by the tables, and in pictures
+        good: tuple[float, float] | None = None  # decibels by the tables, and in pictures
+        bad: tuple[float, float] | None = None
+        curves, haste, aim = choice.curves, 1.0, quality + QUALITY_MARGIN / 2
         for _ in range(QUALITY_TRIES):
             written = self._write(file, choice)
             with self.asked.stages.timed("check"):
                 scene, _ = decoded(self.path, self.asked.plugins, self.asked.device)
                 reached = self.held_out.quality(scene).psnr
                 scene.shelf.close()
-            if reached >= quality and (best is None or written < best[0]):
-                best = written, choice
+            here = decibels(choice.allocation.error), reached
+            if reached >= quality:
+                best, good = (written, choice) if best is None or written < best[0] else best, here
+            else:
+                bad = here
             if quality <= reached <= quality + QUALITY_MARGIN or (reached < quality and choice.is_finest):
                 break
-            known.append((decibels(choice.allocation.error), reached))
-            slope = 1.0  # part of the error may be of what is gone, which no precision mends
-            if len(known) > 1 and known[-1][0] != known[-2][0]:
-                slope = min(max((known[-1][1] - known[-2][1]) / (known[-1][0] - known[-2][0]), 0.25), 2.0)
-            wanted = known[-1][0] + (quality + QUALITY_MARGIN / 2 - reached) / slope
-            choice = replace(choice, allocation=of_error(choice.curves, 10 ** (-wanted / 10)))
+            if best is not None and curves is choice.curves:  # a bit of the positions is a jump: go on from it
+                curves, bad, haste = best[1].placed(), None, 1.0
+            if good is not None and bad is not None:
+                share = min(max((aim - bad[1]) / max(good[1] - bad[1], 1e-6), 0.1), 0.9)
+                wanted = bad[0] + share * (good[0] - bad[0])
+            else:  # part of the error may be of what is gone, which no precision mends
+                wanted, haste = here[0] + haste * (aim - reached), 2 * haste
+            choice = replace(choice, allocation=of_error(curves, 10 ** (-wanted / 10)))
         if best is None:
             raise UserInputError(
                 f"the finest settings that were tried reach {reached:.1f} dB against the source, which is less than "
@@ -300,9 +307,10 @@ class _Work:
         if self.asked.gaussians is not None:
             count = min(self.asked.gaussians, whole)
         power = self.sample.reduction.power(choice.model.num_rows)
-        with self.asked.stages.timed("reduce"):
-            reduction = Reduction(scene.light, self._pruning)
+        reduction = Reduction(scene.light, self._pruning)
+        with self.asked.stages.timed("score"):
             rows = self._pruning.rows(reduction.kept(count, power) if count < whole else whole)
+        with self.asked.stages.timed("reduce"):
             importance = list[Tensor]()
             tiles = _reduced(scene, rows, min(count / len(rows), 1.0), power, reduction, importance, self.asked)
             found = LargeScene.of_tiles(tiles, self._shelf())
@@ -342,3 +350,4 @@ def _reduced(
             importance.append(of)
             yield model
             bar.advance()
+            give_back()

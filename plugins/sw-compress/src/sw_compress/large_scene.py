@@ -18,6 +18,7 @@ from sw_reference.spherical_harmonics import sh_colors
 from torch import Tensor
 
 from splatwizard_core.api import SH, Camera, GaussianInputs, GaussianModel, SceneError
+from sw_compress.ply_blocks import PlyBlocks
 from sw_compress.rows import like, select
 from sw_compress.shelf import Place, Shelf
 from sw_compress.source import FAINTEST
@@ -129,9 +130,7 @@ class LargeScene:
         return cls(joined(lights, lights[0]), degree, limits, shelf, places, [None] * len(places))
 
 
-def read_scene(
-    blocks: Iterable[GaussianModel], shelf: Shelf, device: torch.device, name: str
-) -> tuple[LargeScene, int]:
+def read_scene(blocks: PlyBlocks, shelf: Shelf, device: torch.device, name: str) -> tuple[LargeScene, int]:
     """Read a scene, without what can never be drawn; and how many Gaussians mean something.
 
     blocks      rows of a file, which are read twice
@@ -139,17 +138,25 @@ def read_scene(
 
     Raises SceneError where nothing can be seen, UserInputError for surfels.
     """
-    lights, read, degree = list[GaussianModel](), 0, 0
+    read = count = degree = 0
+    raw: dict[str, Tensor] = {}  # of all rows at once: many small tensors would leave holes in memory
     for block in blocks:
         refuse_surfels(block, f"{name}: `sw compress`")
         read, degree = read + block.num_rows, block.active_sh_degree
-        lights.append(_light(_drawn(block)))
-    if not sum(each.num_rows for each in lights):
+        told = _light(_drawn(block))
+        if not raw:
+            raw = {
+                each: getattr(told, each).new_empty(blocks.count, *getattr(told, each).shape[1:]) for each in told.RAW
+            }
+        for each, values in raw.items():
+            values[count : count + told.num_rows] = getattr(told, each)
+        count += told.num_rows
+    if not count:
         raise SceneError(f"{name}: holds no Gaussian that could be seen")
-    light = joined(lights, lights[0])
+    light = like(told, GaussianModel(**{each: values[:count] for each, values in raw.items()}))
+    del raw
     order = _morton_order(light.means.detach())
     light = select(light, order)
-    count = light.num_rows
     size = max(TILE, -(-count // MOST_TILES))
     limits = [*range(0, count, size), count]
     tile_of = torch.empty(count, dtype=torch.uint8)

@@ -70,15 +70,15 @@ def removal_costs(
             squared_error += float(residual.double().square().sum())
             specs.append(ScoreSpec("cost", "removal", residual=residual))
         options = RasterOptions(background=background, scores=tuple(specs))
-        found = {name: x.double() for name, x in rasterizer.accumulate(inputs, [camera], options).scores.items()}
+        found = rasterizer.accumulate(inputs, [camera], options).scores
         values += 3 * camera.width * camera.height
         if cost is None or change is None:
-            cost, change = torch.zeros_like(found["change"]), torch.zeros_like(found["change"])
+            cost, change = (torch.zeros_like(found["change"], dtype=torch.float64) for _ in range(2))
             sums = {kind: torch.zeros_like(change) for kind in also}
         change += found["change"]
         cost += found.get("cost", found["change"])
         for kind in also:
-            sums[kind] = torch.maximum(sums[kind], found[kind]) if kind == "blend_max" else sums[kind] + found[kind]
+            sums[kind] = torch.maximum(sums[kind], found[kind]) if kind == "blend_max" else sums[kind].add_(found[kind])
     if cost is None or change is None:
         raise ValueError("costs of removal need at least one view")
     return RemovalCosts(cost, change, squared_error, values, sums)
