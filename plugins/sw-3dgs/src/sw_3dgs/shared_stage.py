@@ -90,8 +90,8 @@ class SharedStage(ThreeDGSStage):
             return
         if state.stage is not self or self.extra_tasks:
             raise ConfigError(
-                f"gpus={self.views_per_step} is for the plan of 3dgs alone: what a method or a configuration adds to it "
-                "does not reach the other processes. Leave it out; a scene to start from takes pretrained.gpus",
+                f"gpus={self.views_per_step} is for the plan of 3dgs alone: what a method or a configuration adds "
+                "to it does not reach the other processes. Leave it out; a scene to start from takes pretrained.gpus",
                 key="gpus",
             )
         make_stage = functools.partial(shared_stage, self._given)
