@@ -220,14 +220,18 @@ class _Work:
         assert choice is not None  # a search looks at one part at least
         file = self._reduced(choice)
         best, most, held = choice, 0, None
+        before: tuple[float, float] | None = None  # bytes by the tables, and of the file
         for _ in range(MOST_ENCODES):
             written, held = self._write(file, choice), choice
             if most < written <= size:
                 best, most = choice, written
             if LEAST_SHARE * size < written <= size or (written <= size and choice.is_finest):
                 break
-            # As far off as it is, so far the next one will be.
-            wanted = sample.bytes_of(AIM * size) * (choice.bytes / sample.bytes_of(written))
+            power = 1.0  # of the bytes of the file with which those of the tables grow
+            if before is not None and written != before[1]:
+                power = math.log(choice.bytes / before[0]) / math.log(written / before[1])
+            before = choice.bytes, written
+            wanted = choice.bytes * (AIM * size / written) ** min(max(power, 0.5), 2.0)
             resized = choice.resized(wanted)
             if resized is None or resized.allocation.levels == choice.allocation.levels:
                 resized = choice.coarsest() if written > size else None
