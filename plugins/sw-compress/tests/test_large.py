@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from sw_compress import Compressed, compress, large, large_scene, ply_blocks
+from sw_compress import Compressed, compress, large, large_scene, ply_blocks, search
 from sw_compress.among import Among, coarse, sample_rows, without
 from sw_compress.large_scene import LargeScene, read_scene
 from sw_compress.ply_blocks import blocks_of
@@ -48,6 +48,7 @@ def low_limits() -> Iterator[None]:
         patch.setattr(large, "LARGE", {"cpu": 500})
         patch.setattr(large, "SAMPLE", 600)
         patch.setattr(large, "RUN", 100)
+        patch.setattr(search, "SHARES", (1.0, 0.5))
         patch.setattr(large_scene, "TILE", 800)
         patch.setattr(ply_blocks, "ROWS_AT_ONCE", 400)
         yield
@@ -113,7 +114,7 @@ def test_a_size_out_of_reach_names_the_smallest(source, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("stage", "stop"), [("read", OSError(errno.ENOSPC, "No space left on device")), ("reduce", KeyboardInterrupt())]
+    ("stage", "stop"), [("read", OSError(errno.ENOSPC, "No space left on device")), ("sample", KeyboardInterrupt())]
 )
 def test_an_interruption_and_a_full_disk_leave_nothing(source, tmp_path, monkeypatch, stage: str, stop: BaseException):
     out, timed = tmp_path / "a.swz", Stages.timed
