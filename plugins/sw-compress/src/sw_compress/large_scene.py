@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
-from sw_gaussians.morton import BITS, interleave
+from sw_gaussians.morton import morton_order
 from sw_gaussians.surfels import refuse_surfels
 from sw_reference.spherical_harmonics import sh_colors
 from torch import Tensor
@@ -31,7 +31,7 @@ TILE = 1 << 20
 MOST_TILES = 64
 """As many packets as a file can have; a larger scene has larger tiles."""
 ROWS_AT_ONCE = 1 << 16
-"""Rows whose colours, or cells, are found together."""
+"""Rows whose colours are found together."""
 
 
 @dataclass
@@ -155,7 +155,7 @@ def read_scene(blocks: PlyBlocks, shelf: Shelf, device: torch.device, name: str)
         raise SceneError(f"{name}: holds no Gaussian that could be seen")
     light = like(told, GaussianModel(**{each: values[:count] for each, values in raw.items()}))
     del raw
-    order = _morton_order(light.means.detach())
+    order = morton_order(light.means.detach())
     light = select(light, order)
     size = max(TILE, -(-count // MOST_TILES))
     limits = [*range(0, count, size), count]
@@ -188,14 +188,6 @@ def joined(parts: Sequence[GaussianModel], told: GaussianModel) -> GaussianModel
             if each is not told:
                 setattr(each, name, torch.nn.Parameter(raw[name][:0], requires_grad=False))
     return like(told, GaussianModel(**raw))
-
-
-def _morton_order(points: Tensor) -> Tensor:
-    """Rows [N] int64 of points [N,3], as `sw_gaussians.morton.morton_order`, with doubles of a few at a time."""
-    low, high = points.amin(dim=0), points.amax(dim=0)
-    step = (2**BITS - 1) / (high - low).clamp_min(1e-30).double()
-    codes = [interleave(((part - low).double() * step).long()) for part in points.split(ROWS_AT_ONCE)]
-    return torch.argsort(torch.cat(codes), stable=True)
 
 
 def _drawn(model: GaussianModel) -> GaussianModel:

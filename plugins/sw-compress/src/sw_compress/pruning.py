@@ -10,12 +10,13 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
-from sw_gaussians.morton import interleave
+from sw_gaussians.morton import ROWS_AT_ONCE, interleave
 from sw_gaussians.removal import removal_costs
 from torch import Tensor
 
 from splatwizard_core.api import Camera, track
 from sw_compress.rows import select
+from sw_compress.stages import give_back
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Rasterizer
@@ -100,6 +101,7 @@ class Pruning:
 
     def _score(self) -> None:
         """Judge what is left: infinite for what may not go, below zero for what is not seen and may."""
+        give_back()
         part = self._model if not self._gone else self._select(self._model, self._left)
         with track(f"judge {len(self._left):,} Gaussians", total=len(self._cameras), unit="views") as bar:
             costs = removal_costs(
@@ -114,10 +116,10 @@ class Pruning:
 
     def _among_neighbours(self, order: Tensor) -> Tensor:
         """Count those of the same block of neighbours that come before each of `order` [n] in it."""
-        means = self._model.means.detach()[self._left].double()
-        low, high = means.amin(0), means.amax(0)
-        cells = ((means - low) / (high - low).clamp_min(1e-30) * ((1 << 20) - 1)).long()
-        along = interleave(cells).argsort(stable=True)
+        means = self._model.means.detach()[self._left]
+        low, high = means.amin(0).double(), means.amax(0).double()
+        units = ((part.double() - low) / (high - low).clamp_min(1e-30) for part in means.split(ROWS_AT_ONCE))
+        along = torch.cat([interleave((unit * ((1 << 20) - 1)).long()) for unit in units]).argsort(stable=True)
         block = torch.empty_like(along)
         block[along] = torch.arange(len(along), device=along.device) // NEIGHBOURS
         by_block = torch.sort(block[order], stable=True)

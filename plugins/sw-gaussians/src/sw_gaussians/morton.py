@@ -9,6 +9,8 @@ from torch import Tensor
 
 BITS = 21
 """Bits per axis; three axes fill an int64."""
+ROWS_AT_ONCE = 1 << 18
+"""Points whose cells are found together: those of all would be the largest thing in memory."""
 _SPREAD = (
     (32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3),
     (2, 0x1249249249249249),
@@ -24,9 +26,9 @@ def morton_order(points: Tensor) -> Tensor:
     if len(points) == 0:
         return torch.zeros(0, dtype=torch.int64, device=points.device)
     low, high = points.amin(dim=0), points.amax(dim=0)
-    unit = ((points - low) / (high - low).clamp_min(1e-30)).double()
-    cells = (unit * (2**BITS - 1)).long()
-    return torch.argsort(interleave(cells), stable=True)
+    units = (((part - low) / (high - low).clamp_min(1e-30)).double() for part in points.split(ROWS_AT_ONCE))
+    codes = torch.cat([interleave((unit * (2**BITS - 1)).long()) for unit in units])
+    return torch.argsort(codes, stable=True)
 
 
 def interleave(cells: Any) -> Any:
