@@ -246,6 +246,33 @@ def test_native_partners_are_those_of_the_plain_version(bands, weighted):
     assert int(plain.isinf().sum()) < 1450
 
 
+@pytest.mark.parametrize("widen", [False, True])
+def test_native_merging_is_that_of_the_plain_version(widen):
+    if not GAUSSIANS.try_load():
+        pytest.skip("no compiled kernels")
+    splats = Splats(*(each[:, 0].float() for each in random_splats(600, 1)))
+    scales, opacities = splats.scales.clone(), splats.opacities.clone()
+    scales[:20, 2], scales[20:40, 1:], scales[40:50], scales[50:60] = 1e-9, 1e-4, 1e-9, 1e3
+    opacities[::7], opacities[60:80] = 0, 1
+    quats = splats.quats * torch.linspace(0.5, 2, 600)[:, None]
+    splats = splats._replace(scales=scales, opacities=opacities, quats=quats)
+    splats.means[40:50], splats.means[80:120] = splats.means[40].clone(), splats.means[80].clone()
+    pairs = torch.arange(600).view(300, 2)
+    plain, native = (simplifying._Pool.of(Splats(*(each.clone() for each in splats)), None) for _ in range(2))
+    simplifying._merge(plain, pairs, widen)
+    simplifying._native_merge(native, pairs, widen)
+    assert torch.allclose(plain.splats.means, native.splats.means, rtol=1e-6)
+    assert torch.allclose(plain.splats.opacities, native.splats.opacities, rtol=1e-5)
+    sizes = plain.splats.scales.amax(dim=1, keepdim=True)  # float64 knows variances to 1e-16 of the largest
+    assert torch.allclose(plain.splats.scales / sizes, native.splats.scales / sizes, atol=1e-7)
+    assert torch.allclose(plain.splats.sh, native.splats.sh, atol=1e-6)
+    # Of axes that are equally long any two do, so it is their covariances that are equal.
+    shapes = [pool.table[:, 3:9] * (pool.unit / sizes) ** 2 for pool in (plain, native)]
+    assert torch.allclose(*shapes, atol=1e-6)
+    others = [0, 1, 2, *range(9, 15)]
+    assert torch.allclose(plain.table[:, others], native.table[:, others], rtol=1e-4, atol=1e-6)
+
+
 def test_a_window_that_is_none_is_refused():
     if not GAUSSIANS.try_load():
         pytest.skip("no compiled kernels")
@@ -258,6 +285,17 @@ def test_a_row_that_is_not_there_is_refused():
         pytest.skip("no compiled kernels")
     with pytest.raises(RuntimeError, match="row 2 of 2"):
         merge_partners(torch.arange(1, 3), 8)
+
+
+def test_a_pair_that_is_not_there_is_refused():
+    if not GAUSSIANS.try_load():
+        pytest.skip("no compiled kernels")
+    with pytest.raises(RuntimeError, match="row 2 of 2"):
+        face.merge_pairs(
+            means=torch.zeros(2, 3), scales=torch.ones(2, 3), quats=torch.ones(2, 4), opacities=torch.ones(2),
+            sh=torch.zeros(2, 3), table=torch.zeros(2, 15), pairs=torch.tensor([[0, 2]]), unit=1.0,
+            center=torch.zeros(3), widen=0,
+        )  # fmt: skip
 
 
 def merge_partners(order: torch.Tensor, window: int) -> None:

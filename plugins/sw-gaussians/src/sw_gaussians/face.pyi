@@ -39,3 +39,19 @@ def merge_partners(
     best: Tensor | Array[Any] | int,
     partner: Tensor | Array[Any] | int,
 ) -> Structure: ...
+def merge_pairs(
+    *,
+    means: Tensor | Array[Any] | int,
+    scales: Tensor | Array[Any] | int,
+    quats: Tensor | Array[Any] | int,
+    opacities: Tensor | Array[Any] | int,
+    sh: Tensor | Array[Any] | int,
+    table: Tensor | Array[Any] | int,
+    pairs: Tensor | Array[Any] | int,
+    rows: int | None = None,
+    n: int | None = None,
+    width: int | None = None,
+    unit: float,
+    center: Tensor | Array[Any] | int,
+    widen: int,
+) -> Structure: ...

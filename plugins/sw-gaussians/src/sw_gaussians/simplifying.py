@@ -34,8 +34,6 @@ CELLS = 20
 """Bits of a coordinate along the curve."""
 PAIRS_AT_ONCE = {"cpu": 1 << 14, "cuda": 1 << 17}
 """Pairs that merge together: in float64 each takes some kB on the way, which stay in the cache of a core."""
-COEFFICIENTS_AT_ONCE = 4
-"""Spherical harmonics that are put into another order together: they are most of a Gaussian."""
 ROWS_AT_ONCE = {"cpu": 1 << 14, "cuda": 1 << 21}
 """Pairs whose prices are found together: intermediate columns stay in the cache of a core."""
 MEASURED = {"cpu": 1 << 17, "cuda": 1 << 15}
@@ -55,7 +53,8 @@ def merged_to(
     The result is a new model without the SH bands that were not active; one that is small enough already is copied.
     Raises ShapeError for surfels.
     """
-    splats, _, left = _reduced(splats_of(model), count, significance, widen)
+    rows = torch.arange(model.num_rows, device=model.device)
+    splats, _, left = _reduced(model, rows, count, significance, widen)
     return model_of(splats, left, model)
 
 
@@ -67,22 +66,22 @@ def merged_by(
 
     significance    [M] of these rows; of the result it is the sum over what it stands for
     """
-    splats, weights, left = _reduced(splats_of(model, rows), count, significance, widen)
+    splats, weights, left = _reduced(model, rows, count, significance, widen)
     assert weights is not None  # they were given
     found = weights[left].to(significance) * significance.median().clamp_min(1e-30)
     return model_of(splats, left, model), found
 
 
 def _reduced(
-    splats: Splats, count: int, significance: Tensor | None, widen: bool
+    model: GaussianModel, rows: Tensor, count: int, significance: Tensor | None, widen: bool
 ) -> tuple[Splats, Tensor | None, Tensor]:
-    """Merge until at most so many are left: all rows, what they weigh in medians, and which are left [n].
-
-    Overwrites the SH of those given.
-    """
-    weights = None if significance is None else (significance / significance.median().clamp_min(1e-30)).to(splats.means)
-    pool = _Pool.of(splats, weights)
-    del splats  # the pool has a copy of all but SH
+    """Merge some rows of a model until at most so many are left: all Gaussians, what they weigh in medians, and which
+    are left [n]."""
+    curve = _curve(model.means.detach().index_select(0, rows), 0)
+    weights = None
+    if significance is not None:
+        weights = (significance / significance.median().clamp_min(1e-30)).to(model.means)[curve]
+    pool = _Pool.of(splats_of(model, rows[curve]), weights)
     near, wave = NEAR, 0
     while (n := len(pool.order)) > max(count, 1):
         trim()
@@ -117,13 +116,16 @@ class _Pool:
 
     @classmethod
     def of(cls, splats: Splats, weights: Tensor | None) -> _Pool:
-        """Gaussians along a curve: their SH change places, other values are copied."""
-        rows = _curve(splats.means, 0)
-        splats, weights = _ordered(splats, rows), None if weights is None else weights[rows]
+        """These Gaussians, best along a curve; they are overwritten."""
         unit, center = _unit(splats), splats.means.mean(dim=0)
         parts = (Splats(*each) for each in zip(*map(_blocks, splats), strict=True))
         table = torch.cat([_table(part, unit, center) for part in parts])
-        return cls(splats, weights, table, torch.arange(len(rows), device=rows.device), unit, center)
+        return cls(splats, weights, table, torch.arange(len(table), device=table.device), unit, center)
+
+    @property
+    def is_native(self) -> bool:
+        """Whether the compiled kernels take these Gaussians: float32 on the CPU."""
+        return self.table.device.type == "cpu" and self.table.dtype == torch.float32 and GAUSSIANS.try_load()
 
     def follow_curve(self, wave: int) -> None:
         """Bring what is left into the order of a wave's curve."""
@@ -137,11 +139,7 @@ class _Pool:
 
     def merge(self, pairs: Tensor, widen: bool) -> None:
         """One Gaussian in place of each pair of rows [P,2]."""
-        for part in pairs.split(_at_once(PAIRS_AT_ONCE, pairs)):
-            new = merge_groups(self.splats.rows(part), widen=widen).to(self.table.dtype)
-            for all_of, values in zip(self.splats, new, strict=True):
-                all_of[part[:, 0]] = values
-            self.table[part[:, 0]] = _table(new, self.unit, self.center)
+        (_native_merge if self.is_native else _merge)(self, pairs, widen)
         if self.weights is not None:
             self.weights[pairs[:, 0]] = self.weights[pairs].sum(dim=1)
         gone = torch.zeros(len(self.table), dtype=torch.bool, device=pairs.device)
@@ -209,12 +207,29 @@ def _curve(points: Tensor, wave: int) -> Tensor:
 
 def _wave(pool: _Pool, near: float, wave: int) -> Tensor:
     """Pairs [P,2] of rows that are each other's cheapest neighbours along the curve, the cheapest first."""
-    native = pool.table.device.type == "cpu" and pool.table.dtype == torch.float32 and GAUSSIANS.try_load()
-    best, partner = (_native_partners if native else _partners)(pool, near, wave)
+    best, partner = (_native_partners if pool.is_native else _partners)(pool, near, wave)
     places = torch.arange(len(best), device=best.device)
     first = places[(partner > places) & (partner[partner] == places)]
     first = first[torch.argsort(best[first], stable=True)]
     return pool.order[torch.stack([first, partner[first]], dim=1)]
+
+
+def _merge(pool: _Pool, pairs: Tensor, widen: bool) -> None:
+    """Merge each pair of rows [P,2] into its first row."""
+    for part in pairs.split(_at_once(PAIRS_AT_ONCE, pairs)):
+        new = merge_groups(pool.splats.rows(part), widen=widen).to(pool.table.dtype)
+        for all_of, values in zip(pool.splats, new, strict=True):
+            all_of[part[:, 0]] = values
+        pool.table[part[:, 0]] = _table(new, pool.unit, pool.center)
+
+
+def _native_merge(pool: _Pool, pairs: Tensor, widen: bool) -> None:
+    """The same as `_merge`, of Gaussians in float32 on the CPU."""
+    splats = pool.splats
+    face.merge_pairs(
+        means=splats.means, scales=splats.scales, quats=splats.quats, opacities=splats.opacities,
+        sh=splats.sh.flatten(1), table=pool.table, pairs=pairs, unit=pool.unit, center=pool.center, widen=int(widen),
+    )  # fmt: skip
 
 
 def _native_partners(pool: _Pool, near: float, wave: int) -> tuple[Tensor, Tensor]:
@@ -276,10 +291,3 @@ def _lot(rows: Tensor, offset: Tensor, wave: int) -> Tensor:
     mixed = (rows * 2654435761 + offset * 40503 + wave * 97) & 0xFFFFFFFF
     mixed = ((mixed ^ (mixed >> 15)) * 2246822519) & 0xFFFFFFFF
     return ((mixed ^ (mixed >> 13)) & 0xFFFF).float() / 65535
-
-
-def _ordered(splats: Splats, order: Tensor) -> Splats:
-    """The Gaussians in another order; their SH in place."""
-    for some in splats.sh.split(COEFFICIENTS_AT_ONCE, dim=1):
-        some.copy_(some[order])
-    return Splats(*(values[order] for values in splats[:4]), splats.sh)

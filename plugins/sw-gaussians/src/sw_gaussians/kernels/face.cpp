@@ -33,3 +33,17 @@ SW_OPERATION(splatwizard_gaussians, merge_partners) {
     SW_SELECT(merge_partners)(args, parallel);
   });
 }
+
+SW_OPERATION(splatwizard_gaussians, merge_pairs) {
+  return splatwizard::guarded(call, [&](const splatwizard::Parallel& parallel) {
+    if (call->rows < 0 || call->n < 0 || call->width < 3)
+      refuse("%lld rows of %lld coefficients", (long long)call->rows, (long long)call->width);
+    for (int64_t i = 0; i < 2 * call->n; ++i)
+      if (call->pairs[i] < 0 || call->pairs[i] >= call->rows)
+        refuse("row %lld of %lld", (long long)call->pairs[i], (long long)call->rows);
+    const splatwizard::MergePairsArgs args{
+        call->means, call->scales, call->quats, call->opacities, call->sh, call->table, call->pairs,
+        call->n, call->width, float(call->unit), call->center, call->widen != 0};
+    SW_SELECT(merge_pairs)(args, parallel);
+  });
+}

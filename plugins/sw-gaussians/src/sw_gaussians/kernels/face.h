@@ -38,3 +38,20 @@ typedef struct {
   int64_t* partner;       // [n] a place in the order
 } merge_partners_call;
 SW_OPERATION(splatwizard_gaussians, merge_partners);
+
+// One Gaussian in place of each pair of rows, by merge_groups of merging.py and the ink rule; it stands in the first row.
+typedef struct {
+  sw_head head;
+  float* means;           // [rows, 3]
+  float* scales;          // [rows, 3] standard deviations
+  float* quats;           // [rows, 4]
+  float* opacities;       // [rows]
+  float* sh;              // [rows, width]
+  float* table;           // [rows, 15] as above; the first row of each pair is written
+  const int64_t* pairs;   // [n, 2] no row twice
+  int64_t rows, n, width;
+  double unit;            // size of the scene
+  const float* center;    // [3] origin of the places in the table
+  int64_t widen;          // 1: grow where opacity 1 is not enough; else 0
+} merge_pairs_call;
+SW_OPERATION(splatwizard_gaussians, merge_pairs);

@@ -36,11 +36,24 @@ struct MergePartnersArgs {
   int64_t* partner;  // its place
 };
 
+// Pairs of rows that merge in place: the first of each becomes the two.
+struct MergePairsArgs {
+  float *means, *scales, *quats, *opacities;  // [rows] of 3, 3, 4, 1
+  float* sh;                                  // [rows, width]
+  float* table;                               // [rows, 15]
+  const int64_t* pairs;                       // [n, 2], no row twice
+  int64_t n, width;
+  float unit;
+  const float* center;  // [3]
+  bool widen;
+};
+
 }  // namespace splatwizard
 
 #define SW_DECLARE_GAUSSIANS(arch)                                                                    \
   namespace arch {                                                                                    \
   void sparse_adam(const splatwizard::SparseAdamArgs& args, const splatwizard::Parallel& parallel);  \
   void merge_partners(const splatwizard::MergePartnersArgs& args, const splatwizard::Parallel& parallel); \
+  void merge_pairs(const splatwizard::MergePairsArgs& args, const splatwizard::Parallel& parallel);  \
   }
 SW_FOR_EACH_ARCH(SW_DECLARE_GAUSSIANS)
