@@ -46,21 +46,28 @@ def tiles(static: dict[str, Any], sections: dict[str, bytes]) -> dict[str, np.nd
     groups, base = static["groups"], static["base"]
     check(static["first"] + sum(n for _, n, _ in groups) == static["num_gaussians"], "rows of the groups")
     packets = max(int(name.partition("/")[0]) for name in sections) if sections else 0
-    last = {tile: number for number, (tile, _, _) in enumerate(groups[: max(packets - 1, 0)], 2)}
+    finer = {source: packet for packet, source in static.get("finer", []) if packet <= packets}
+    numbers = [packet for packet in range(2, packets + 1) if packet not in finer.values()]
+    last = {tile: number for number, (tile, _, _) in zip(numbers, groups, strict=False)}
     shown_base = [tile not in last for tile, n in enumerate(base) for _ in range(n)]
     runs = [("1/", static["first"], [True] * static["first"]), ("1/stand-ins/", sum(base), shown_base)]
-    for number, (tile, n, m) in enumerate(groups[: max(packets - 1, 0)], 2):
+    for number, (tile, n, m) in zip(numbers, groups, strict=False):
         runs += [(f"{number}/", n, [True] * n), (f"{number}/stand-ins/", m, [last[tile] == number] * m)]
+    width = 10 + 3 * ((static["active_sh_degree"] + 1) ** 2 - 1)
     parts: list[dict[str, np.ndarray]] = []
     for prefix, n, shown in runs:
         if n:
             part = {name: sections[prefix + name] for name in SECTIONS if prefix + name in sections}
-            rows = quantized_rows({**static, "num_gaussians": n}, part)
+            packet = finer.get(int(prefix[:-1])) if prefix[:-1].isdigit() else None
+            lacks = None if packet is None else np.array(columns(sections[f"{packet}/finer"], n, 3 + width), np.int64)
+            rows = quantized_rows({**static, "num_gaussians": n}, part, lacks)
             parts.append({name: values[np.array(shown)] for name, values in rows.items()})
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def quantized_rows(static: dict[str, Any], sections: dict[str, bytes]) -> dict[str, np.ndarray]:
+def quantized_rows(
+    static: dict[str, Any], sections: dict[str, bytes], lacks: np.ndarray | None = None
+) -> dict[str, np.ndarray]:
     n, active = static["num_gaussians"], static["active_sh_degree"]
     points = octree(sections["positions"])
     check(len(points) == n, "number of points")
@@ -78,6 +85,16 @@ def quantized_rows(static: dict[str, Any], sections: dict[str, bytes]) -> dict[s
         activity = [sum(map(abs, row)) for row in zip(*integers, strict=True)] if band > 1 else k
         number = 1 if band == 1 and not by_class else classes
         integers += band_columns(sections[f"sh{band}"], n, 3 * (2 * band + 1), number, activity)
+    times, raw = static.get("times", 1), static.get("raw", 0)
+    points = (points << raw) + (lacks[:3].T if lacks is not None else (1 << raw) // 2)
+    at = 3
+    for name, values in base.items():
+        base[name] = values * times + (0 if lacks is None else lacks[at : at + len(values)])
+        at += len(values)
+    for j, column in enumerate(integers):
+        integers[j] = [
+            times * value + (0 if lacks is None else int(lacks[at + j, i])) for i, value in enumerate(column)
+        ]
     rest = np.zeros((n, (static["max_sh_degree"] + 1) ** 2 - 1, 3), np.float32)
     if static.get("sh_basis", False):
         width = len(integers)

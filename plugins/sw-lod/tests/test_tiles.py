@@ -54,29 +54,49 @@ def test_the_whole_file_holds_what_one_without_packets_holds(data, model):
 
 def test_prefixes_grow_from_the_base(data):
     reader = ContainerReader(data)
-    first, base, groups = (reader.static[name] for name in ("first", "base", "groups"))
-    assert (first, len(base), len(groups), len(reader.cuts)) == (24, 3, 6, 7)
-    assert decoded(data, 1).num_rows == first + sum(base) == pytest.approx(144, abs=12)
+    first, base, groups, finer = (reader.static[name] for name in ("first", "base", "groups", "finer"))
+    assert (first, len(base), len(groups), len(finer), len(reader.cuts)) == (48, 3, 6, 7, 14)
+    assert decoded(data, 1).num_rows == first + sum(base) == pytest.approx(168, abs=12)
     for packets in range(2, 8):
         there = groups[: packets - 1]
         stand_ins = dict(enumerate(base)) | {tile: m for tile, _, m in there}
         assert decoded(data, packets).num_rows == first + sum(n for _, n, _ in there) + sum(stand_ins.values())
 
 
-def test_what_stays_is_there_from_its_packet_on(data):
+@torch.no_grad()
+def test_what_is_coarse_becomes_finer_packet_by_packet(data, model):
+    """Within half of seven steps before, and exactly from the packet on that makes it finer."""
+    reader = ContainerReader(data)
+    first, groups = reader.static["first"], reader.static["groups"]
+    ends = dict(enumerate(np.cumsum([first, *(n for _, n, _ in groups)]), 1))
+    whole, step = decoded(data).opacity_logits, reader.static["opacity_step"]
+    assert reader.static["finer"][0][0] == 8  # all Gaussians are there, none is as it will be
+    coarse = torch.ones(len(whole), dtype=torch.bool)
+    for packets in range(7, 15):
+        if source := dict(reader.static["finer"]).get(packets):
+            coarse[ends[source - 1] if source > 1 else 0 : ends[source]] = False
+        some = decoded(data, packets).opacity_logits
+        assert torch.equal(some[~coarse], whole[~coarse])
+        assert float((some - whole).abs().max()) <= 3.001 * step
+        assert not coarse.any() or float((some - whole)[coarse].abs().max()) > 2 * step
+    assert not coarse.any()
+
+
+def test_without_steps_in_between_what_stays_is_there_from_its_packet_on(model):
+    data = encoded(model, rows=400, coarsest=10, stand_ins=10, times=1, raw=0)
+    assert ContainerReader(data).static["finer"] == []
     places = [{tuple(row) for row in decoded(data, packets).means.tolist()} for packets in range(1, 8)]
-    whole = places[-1]
     for less, more in itertools.pairwise(places):
-        assert less & whole <= more
+        assert less & places[-1] <= more
+    assert len(places[0] & places[-1]) >= 48
 
 
 def test_stand_ins_look_alike_from_all_sides(data):
-    whole = {tuple(row) for row in decoded(data).means.tolist()}
-    some = decoded(data, 1)
-    stands_in = torch.tensor([tuple(row) not in whole for row in some.means.tolist()])
-    assert stands_in.sum() > 100
-    assert not some.sh_rest[stands_in].any()
-    assert some.sh_rest[~stands_in].any()
+    rest = decoded(data, 1).sh_rest
+    first = ContainerReader(data).static["first"]
+    assert len(rest) > first + 100
+    assert not rest[first:].any()
+    assert rest[:first].any()
 
 
 @torch.no_grad()
@@ -121,7 +141,9 @@ def test_surfels_are_refused(model):
     [
         {"base": [1, 2]}, {"base": [2**32 - 1] * 255}, {"num_gaussians": 2**32 - 1}, {"primitive": "surfel"},
         {"groups": []}, {"groups": [[300, 1, 0]]}, {"packets": [[1200, 0.0]]}, {"base": -1}, {"first": 23},
-        {"first": 2**32 - 1},
+        {"first": 2**32 - 1}, {"times": 2}, {"raw": 13}, {"raw": 18}, {"finer": []}, {"finer": [[1, 1]] * 7},
+        {"finer": [[8, 9]] + [[packet, packet - 7] for packet in range(9, 15)]},
+        {"finer": [[packet, 1] for packet in range(8, 15)]},
     ],
 )  # fmt: skip
 def test_a_header_that_does_not_fit_is_refused(data, change):
@@ -129,6 +151,32 @@ def test_a_header_that_does_not_fit_is_refused(data, change):
     reader.static.update(change)
     with pytest.raises(BitstreamError):
         Tiles(load_plugins()).decode(reader)
+
+
+@pytest.mark.parametrize(
+    ("section", "column", "value", "told"),
+    [
+        ("finer", 0, 32, "more than 5 bits"), ("finer", 2, -1, "more than 5 bits"), ("finer", 3, 4, "beyond 3"),
+        ("opacity", 0, 2**30 // 7 + 1, "packet 1 is beyond"),
+    ],
+)  # fmt: skip
+def test_values_that_no_coarse_row_lacks_are_refused(data, section, column, value, told):
+    reader, columns = ContainerReader(data), load_plugins().entropy_models.load("columns")()
+    rows, width = reader.static["first"], 10 + 3 * 3 + 3 if section == "finer" else 1
+    changed = dict(reader.static["finer"])
+    name = f"{next(packet for packet in changed if changed[packet] == 1)}/finer" if section == "finer" else "1/opacity"
+    symbols = columns.decode(reader.section(name), (rows, width)).copy()
+    symbols[5, column] = value
+    writer, packet = ContainerWriter("m", 1), "1"
+    writer.static.update(reader.static)
+    for each in reader.sections:
+        if each.partition("/")[0] != packet:
+            writer.cut()
+            packet = each.partition("/")[0]
+        writer.add(each, columns.encode(symbols, None) if each == name else reader.section(each))
+    writer.cut()
+    with pytest.raises(BitstreamError, match=told):
+        decoded(writer.to_bytes())
 
 
 def test_a_last_group_with_stand_ins_is_refused(data):
@@ -141,6 +189,6 @@ def test_a_last_group_with_stand_ins_is_refused(data):
 def test_the_command_writes_it(model, tmp_path):
     record = write_lod(model, tmp_path / "x.swz", chunk=600, device="cpu")
     assert record["packets"][-1] == record["bytes"] == (tmp_path / "x.swz").stat().st_size
-    assert len(record["packets"]) == 7
+    assert len(record["packets"]) == 10
     with pytest.raises(UserInputError, match="--levels"):
         write_lod(model, tmp_path / "x.swz", levels=2)

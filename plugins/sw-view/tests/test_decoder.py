@@ -80,8 +80,8 @@ def tampered() -> list[bytes]:
 
 DAMAGED = ("3dgs_r3_v1", "3dgs_exact_v1", "c3dgs_v1", "lightgaussian_ranged_v1", "mesongs_v1", "chimerags_uniform16_v1",
            "3dgs_packets_v1", "wisp_v1", "wisp_none_v1", "hac_exact_v1", "hac_half_v2", "hac_plus_v1",
-           "hac_plus_tiny_v1", "cat_3dgs_refined_v1", "cat_3dgs_refined_v2", "3dgs_tiles_v1", "compact3dgs_v1",
-           "compact3dgs_one_v1", "compact3dgs_plain_v1", "gsc_quant_v1")  # fmt: skip
+           "hac_plus_tiny_v1", "cat_3dgs_refined_v1", "cat_3dgs_refined_v2", "3dgs_tiles_v1", "3dgs_tiles_v2",
+           "compact3dgs_v1", "compact3dgs_one_v1", "compact3dgs_plain_v1", "gsc_quant_v1")  # fmt: skip
 
 
 def damages(data: bytes) -> list[bytes]:

@@ -14,8 +14,6 @@ namespace swz {
 
 namespace {
 
-constexpr int64_t MAX_SYMBOL = 1 << 30;
-
 // Header values that a method keeps beside those of the codec.
 constexpr const char* BESIDE[] = {"entropy", "positions", "mode", "codec", "method", "depth_ratio", "lambda_dist",
                                   "lambda_normal", "world_origin"};
@@ -170,10 +168,11 @@ double coordinate(const Layout& layout, int axis, int64_t cell) {
   return __builtin_copysign(u, v) * layout.width[axis] + layout.center[axis];
 }
 
-void put_means(const Layout& layout, const Points& points, float* means) {
+void put_means(const Layout& layout, const Points& points, const Coarse& coarse, float* means) {
   for (int64_t i = 0; i < layout.count; ++i)
     for (int axis = 0; axis < 3; ++axis)
-      means[3 * i + axis] = static_cast<float>(coordinate(layout, axis, points.coordinate(i, axis)));
+      means[3 * i + axis] = static_cast<float>(
+          coordinate(layout, axis, coarse.cell(points.coordinate(i, axis), axis, i, layout.count)));
 }
 
 // A column of integers that must not be beyond 2^30; what is, is refused once the whole matrix is known to be sound.
@@ -201,7 +200,11 @@ const double A = 1 / __builtin_sqrt(3.0), B = 1 / __builtin_sqrt(2.0), C = 1 / _
 struct Rows {
   const uint32_t* numbers;
   const double* factors;
+  const Coarse& coarse;
+  int64_t count;  // of the packet
 
+  // A symbol of the layout for that of a column.
+  int64_t fine(int64_t symbol, int64_t column, int64_t i) const { return coarse.symbol(symbol, column, row(i), count); }
   int64_t row(int64_t i) const { return numbers == nullptr ? i : numbers[i]; }
   double step(double step, int64_t i) const { return factors == nullptr ? step : step * factors[row(i)]; }
 };
@@ -224,6 +227,7 @@ struct Target {
   double step;
   float* to;
   int64_t stride;
+  int64_t column;  // the first, of those of all attributes
   int64_t* activity = nullptr;
 };
 
@@ -234,7 +238,10 @@ void put_colors(Matrix& matrix, const Target& target, const Rows& rows) {
     const int64_t* last = matrix.next();
     for (int64_t i = 0; i < matrix.columns.rows; ++i) {
       const double s = rows.step(target.step, i);
-      const double y = symbols.columns[0][i] * s, u = symbols.columns[1][i] * s, v = static_cast<double>(last[i]) * s;
+      const int64_t at = target.column + c;
+      const double y = static_cast<double>(rows.fine(symbols.columns[0][i], at, i)) * s,
+                   u = static_cast<double>(rows.fine(symbols.columns[1][i], at + 1, i)) * s,
+                   v = static_cast<double>(rows.fine(last[i], at + 2, i)) * s;
       float* rgb = target.to + target.stride * rows.row(i) + c;
       rgb[0] = static_cast<float>(A * y + B * u + C * v);
       rgb[1] = static_cast<float>(A * y + 0.0 * u + D * v);
@@ -250,7 +257,8 @@ void put_columns(Matrix& matrix, const Target& target, const Rows& rows) {
   for (int64_t c = 0; c < matrix.columns.width; ++c) {
     const int64_t* values = matrix.next();
     for (int64_t i = 0; i < matrix.columns.rows; ++i)
-      target.to[target.stride * rows.row(i) + c] = static_cast<float>(static_cast<double>(values[i]) * rows.step(target.step, i));
+      target.to[target.stride * rows.row(i) + c] = static_cast<float>(
+          static_cast<double>(rows.fine(values[i], target.column + c, i)) * rows.step(target.step, i));
   }
 }
 
@@ -260,7 +268,9 @@ void put_quats(Matrix& matrix, const Target& target, const Rows& rows) {
   const int64_t* last = matrix.next();
   for (int64_t i = 0; i < matrix.columns.rows; ++i) {
     const double own = rows.step(target.step, i), s = own < coarsest ? own : coarsest;
-    const double x = symbols.columns[0][i] * s, y = symbols.columns[1][i] * s, z = static_cast<double>(last[i]) * s;
+    const double x = static_cast<double>(rows.fine(symbols.columns[0][i], target.column, i)) * s,
+                 y = static_cast<double>(rows.fine(symbols.columns[1][i], target.column + 1, i)) * s,
+                 z = static_cast<double>(rows.fine(last[i], target.column + 2, i)) * s;
     const double squared = x * x + y * y + z * z;
     const double w = __builtin_sqrt(1.0 - squared > 0.0 ? 1.0 - squared : 0.0);
     const double norm = __builtin_sqrt(squared > 1.0 ? squared : 1.0);
@@ -319,7 +329,7 @@ Buffer<uint8_t> classes_of(const Buffer<int64_t>& activity, int64_t count) {
 
 // A section whose rows are in classes by some values, each class a matrix of its own.
 void put_classes(Bytes data, const Buffer<int64_t>& values, int64_t count, int64_t width, const double* factors,
-                 const Target& target) {
+                 const Target& target, const Coarse& coarse) {
   const int64_t n = values.size;
   const Buffer<uint8_t> classes = classes_of(values, count);
   if (data.left < 4 * count) refuse(data.left, " bytes cannot hold the lengths of ", count, " classes");
@@ -337,15 +347,37 @@ void put_classes(Bytes data, const Buffer<int64_t>& values, int64_t count, int64
     const Bytes part = data.take(lengths[k]);
     if (found == 0) continue;
     Matrix matrix(part, found, width);
-    target.put(matrix, target, Rows{rows.data, factors});
+    target.put(matrix, target, Rows{rows.data, factors, coarse, n});
     matrix.finish();
   }
 }
 
 }  // namespace
 
-void decode_rows(Container& file, const Layout& layout, const char* prefix, Gaussians to) {
-  const int64_t n = layout.count;
+void Coarse::read(Container& file, const char* section, int64_t rows, int64_t width) {
+  const Bytes data = file.section(section);
+  const Blame blame(section);
+  lacking = true;
+  columns = Buffer<int16_t>((3 + width) * rows);
+  Matrix matrix(data, rows, 3 + width);
+  bool wide = false, beyond = false;
+  for (int64_t c = 0; c < 3 + width; ++c) {
+    const int64_t* values = matrix.next();
+    for (int64_t i = 0; i < rows; ++i) {
+      if (c < 3)
+        wide |= values[i] < 0 || values[i] >> raw;
+      else
+        beyond |= std::abs(values[i]) > times / 2;
+      columns[c * rows + i] = static_cast<int16_t>(values[i]);
+    }
+  }
+  matrix.finish();
+  if (wide) refuse("a coordinate has more than ", raw, " bits");
+  if (beyond) refuse("a value is beyond ", times / 2);
+}
+
+void decode_rows(Container& file, const Layout& layout, const char* prefix, Gaussians to, const Coarse& coarse) {
+  const int64_t n = layout.count, bits = layout.bits - coarse.raw;
   const auto section_of = [&](const char* name, const auto& decode) {
     Text whole;
     whole.put(prefix), whole.put(name);
@@ -356,13 +388,13 @@ void decode_rows(Container& file, const Layout& layout, const char* prefix, Gaus
   section_of("positions", [&](Bytes data) {
     const Points points = octree(data);
     if (points.codes.size != n) refuse("holds ", grouped(points.codes.size), " points, header says ", grouped(n));
-    if (n && points.bits > layout.bits) {
+    if (n && points.bits > bits) {
       int64_t highest = 0;
       for (int64_t i = 0; i < n; ++i)
         for (int axis = 0; axis < 3; ++axis) highest |= points.coordinate(i, axis);
-      if (highest >> layout.bits) refuse("a point leaves the grid of ", layout.bits, " bits");
+      if (highest >> bits) refuse("a point leaves the grid of ", bits, " bits");
     }
-    put_means(layout, points, to.means);
+    put_means(layout, points, coarse, to.means);
   });
   Buffer<int64_t> precision(layout.precision ? n : 0);
   Buffer<double> factors(precision.size);
@@ -389,21 +421,22 @@ void decode_rows(Container& file, const Layout& layout, const char* prefix, Gaus
   const auto put_sh = layout.basis != nullptr ? put_integers : put_colors;
   const auto sh = [&](const char* name, int64_t band) {
     return Part{name, 3 * (2 * band + 1),
-                {put_sh, layout.rest_step, to.sh_rest + 3 * (band * band - 1), 3 * to.rest, activity.data}};
+                {put_sh, layout.rest_step, to.sh_rest + 3 * (band * band - 1), 3 * to.rest,
+                 7 + layout.scales + 3 * (band * band - 1), activity.data}};
   };
-  const Part parts[] = {{"color", 3, {put_colors, layout.dc_step, to.sh_dc, 3}},
-                        {"opacity", 1, {put_columns, layout.opacity_step, to.opacity_logits, 1}},
-                        {"scales", layout.scales, {put_columns, layout.scale_step, to.log_scales, layout.scales}},
-                        {"quats", 3, {put_quats, layout.quat_step, to.quats, 4}},
+  const Part parts[] = {{"color", 3, {put_colors, layout.dc_step, to.sh_dc, 3, 0}},
+                        {"opacity", 1, {put_columns, layout.opacity_step, to.opacity_logits, 1, 3}},
+                        {"scales", layout.scales, {put_columns, layout.scale_step, to.log_scales, layout.scales, 4}},
+                        {"quats", 3, {put_quats, layout.quat_step, to.quats, 4, 4 + layout.scales}},
                         sh("sh1", 1), sh("sh2", 2), sh("sh3", 3)};
   for (int i = 0; i < 4 + layout.active; ++i)
     section_of(parts[i].name, [&](Bytes data) {
       const Part& part = parts[i];
-      if (i > 4) return put_classes(data, activity, layout.classes, part.width, steps, part.target);
-      if (layout.precision) return put_classes(data, precision, layout.classes, part.width, steps, part.target);
-      if (i == 4) return put_classes(data, activity, 1, part.width, steps, part.target);
+      if (i > 4) return put_classes(data, activity, layout.classes, part.width, steps, part.target, coarse);
+      if (layout.precision) return put_classes(data, precision, layout.classes, part.width, steps, part.target, coarse);
+      if (i == 4) return put_classes(data, activity, 1, part.width, steps, part.target, coarse);
       Matrix matrix(data, n, part.width);
-      part.target.put(matrix, part.target, Rows{nullptr, nullptr});
+      part.target.put(matrix, part.target, Rows{nullptr, nullptr, coarse, n});
       matrix.finish();
     });
   if (layout.basis != nullptr) from_basis(layout, steps, to);

@@ -25,7 +25,29 @@ struct Layout {
 const Json* stated(const Container& file, const char* key);
 int64_t stated_integer(const Container& file, const char* key, int64_t low, int64_t high);
 
+constexpr int64_t MAX_SYMBOL = 1 << 30;
+
+// How rows that are coded coarsely become those of the layout. What they lack is there or not: low bits of the
+// coordinates, then the columns of the attributes, each of as many integers as there are rows.
+struct Coarse {
+  int64_t times = 1, raw = 0;
+  bool lacking = false;
+  Buffer<int16_t> columns;
+  mutable int64_t largest = 0;  // of the coarse symbols
+
+  int64_t symbol(int64_t coarse, int64_t column, int64_t row, int64_t rows) const {
+    const int64_t size = coarse < 0 ? -coarse : coarse;
+    if (size > largest) largest = size;
+    return coarse * times + (lacking ? columns[(3 + column) * rows + row] : 0);
+  }
+  int64_t cell(int64_t coarse, int axis, int64_t row, int64_t rows) const {
+    return (coarse << raw) + (lacking ? columns[axis * rows + row] : (int64_t{1} << raw) >> 1);
+  }
+  // Reads what a section has for so many rows.
+  void read(Container& file, const char* section, int64_t rows, int64_t width);
+};
+
 // The `layout.count` rows of one packet, whose sections have this prefix; `to` begins with the first of them.
-void decode_rows(Container& file, const Layout& layout, const char* prefix, Gaussians to);
+void decode_rows(Container& file, const Layout& layout, const char* prefix, Gaussians to, const Coarse& coarse = {});
 
 }  // namespace swz

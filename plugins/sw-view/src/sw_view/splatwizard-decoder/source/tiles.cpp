@@ -1,4 +1,4 @@
-// Codec `gaussians-tiles`: all coarsely, then place by place as it is (docs/bitstream.md, Gaussians by a codec).
+// Codec `gaussians-tiles`: all coarsely, then place by place, then as exactly as it is (docs/bitstream.md, Gaussians by a codec).
 #include "gaussian_files.h"
 #include "quantized.h"
 
@@ -10,7 +10,7 @@ constexpr int64_t MOST_GROUPS = 255;
 
 // Of a packet behind the first: Gaussians of a tile that stay, then stand-ins until the tile's next group.
 struct Group {
-  int64_t tile, rows, stand_ins;
+  int64_t tile, rows, stand_ins, packet;
 };
 
 // A list of header values, each an integer, or `width` of them in a row.
@@ -41,6 +41,8 @@ struct Plan {
   int64_t base[MOST_GROUPS];  // stand-ins of packet 1 in each tile
   Group group[MOST_GROUPS];
   int64_t last[MOST_GROUPS];  // the group of a tile whose stand-ins are shown; -1: those of packet 1
+  int64_t times = 1, raw = 0;
+  int64_t finer[MOST_GROUPS + 2];  // of a packet the one that makes its rows finer, or 0 where none is there
 
   // Refuses cuts, tiles and groups that make no scene.
   Plan(const Container& file, const Layout& layout) {
@@ -49,11 +51,28 @@ struct Plan {
     first = stated_integer(file, "first", 0, UINT32_MAX);
     tiles = integers_of(file, "base", 1, [&](int64_t i, const int64_t* value) { base[i] = *value; });
     groups = integers_of(file, "groups", 3, [&](int64_t i, const int64_t* values) {
-      group[i] = {values[0], values[1], values[2]};
+      group[i] = {values[0], values[1], values[2], 0};
     });
+    bool is_finer[MOST_GROUPS + 2] = {};
+    int64_t pairs = 0;
+    bool sound = true;
+    for (int64_t& packet : finer) packet = 0;
+    if (file.value("times") != nullptr) times = stated_integer(file, "times", 1, 255);
+    if (file.value("raw") != nullptr) raw = stated_integer(file, "raw", 0, 12);
+    if (file.value("finer") != nullptr)
+      pairs = integers_of(file, "finer", 2, [&](int64_t, const int64_t* values) {
+        const int64_t packet = values[0], source = values[1];
+        sound &= packet >= 2 && packet <= MOST_GROUPS + 1 && source >= 1 && source < packet;
+        if (!sound) return;
+        sound &= !is_finer[packet] && finer[source] == 0;
+        is_finer[packet] = true, finer[source] = packet;
+      });
+    const int64_t packets = groups + pairs + 1;
+    for (int64_t packet = 1; packet < MOST_GROUPS + 2; ++packet)
+      sound &= (!is_finer[packet] || packet <= packets) && (finer[packet] == 0 || !is_finer[packet]);
     int64_t of_last[MOST_GROUPS], sum = first;  // stand-ins of the last group of each tile
     for (int64_t t = 0; t < tiles; ++t) of_last[t] = -1, last[t] = -1;
-    bool fits = file.cuts == groups + 1 && layout.scales == 3;
+    bool fits = sound && file.cuts == packets && layout.scales == 3 && times % 2 == 1 && raw < layout.bits;
     for (int64_t i = 0; i < groups; ++i) {
       sum += group[i].rows;
       fits &= group[i].tile < tiles;
@@ -61,7 +80,15 @@ struct Plan {
     }
     for (int64_t t = 0; t < tiles; ++t) fits &= of_last[t] == 0;
     if (!fits || sum != layout.count) refuse("cuts, tiles and their Gaussians do not fit together");
-    if (groups > file.packets - 1) groups = file.packets - 1;
+    int64_t there = 0;
+    for (int64_t packet = 2; packet <= packets; ++packet) {
+      if (is_finer[packet]) continue;
+      group[there].packet = packet;
+      there += packet <= file.packets;
+      if (packet > file.packets) break;
+    }
+    groups = there;
+    for (int64_t& packet : finer) packet = packet <= file.packets ? packet : 0;
     for (int64_t i = 0; i < groups; ++i) last[group[i].tile] = i;
   }
   int64_t stand_ins() const {
@@ -94,7 +121,7 @@ struct Shown {
 }  // namespace
 
 void decode_tiles(Container& file) {
-  Layout layout(file, {"first", "base", "groups"});
+  Layout layout(file, {"first", "base", "groups", "finer", "times", "raw"});
   const Plan plan(file, layout);
   layout.check();
   int64_t n = plan.first + plan.stand_ins();
@@ -105,14 +132,23 @@ void decode_tiles(Container& file) {
     Text prefix;
     prefix.put(packet), prefix.put("/"), prefix.put(of);
     layout.count = rows;
-    if (rows || !*of) decode_rows(file, layout, prefix.data, part);
+    Coarse coarse{.times = plan.times, .raw = plan.raw};
+    if (rows || !*of) {
+      if (!*of && plan.finer[packet]) {
+        Text section;
+        section.put(plan.finer[packet]), section.put("/finer");
+        coarse.read(file, section.data, rows, 7 + layout.scales + 3 * ((layout.active + 1) * (layout.active + 1) - 1));
+      }
+      decode_rows(file, layout, prefix.data, part, coarse);
+      if (coarse.largest > MAX_SYMBOL / plan.times) refuse("a coarse value of packet ", packet, " is beyond 2^30");
+    }
     part.advance(rows, layout.scales);
   };
   decode(1, "", plan.first);
   decode(1, "stand-ins/", plan.stand_ins());
   for (int64_t i = 0; i < plan.groups; ++i) {
-    decode(i + 2, "", plan.group[i].rows);
-    decode(i + 2, "stand-ins/", plan.group[i].stand_ins);
+    decode(plan.group[i].packet, "", plan.group[i].rows);
+    decode(plan.group[i].packet, "stand-ins/", plan.group[i].stand_ins);
   }
   Shown shown;
   shown.take(plan.first, true);
