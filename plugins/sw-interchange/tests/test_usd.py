@@ -8,7 +8,9 @@ import importlib.util
 import os
 import re
 import subprocess
+import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -231,6 +233,20 @@ def test_a_bad_file_is_refused(name):
     with pytest.raises(BitstreamError, match=reason) as caught:  # the reader's process has a limit of CPU time
         decode(data)
     assert len(str(caught.value)) < 400
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="Linux tells what a process does")
+def test_a_program_that_only_waits_is_ended(tmp_path):
+    program = "import _thread; lock = _thread.allocate_lock(); lock.acquire(); lock.acquire()"
+    start = time.monotonic()
+    assert usd._run([sys.executable, "-S", "-c", program], tmp_path / "answer") != 0
+    assert time.monotonic() - start < 10  # alone on a machine .35 s
+
+
+def test_a_program_that_works_is_waited_for(tmp_path):
+    program = "import time\nend = time.process_time() + .4\nwhile time.process_time() < end: pass\nprint('done')"
+    assert usd._run([sys.executable, "-S", "-c", program], tmp_path / "answer") == 0
+    assert (tmp_path / "answer").read_text() == "done\n"
 
 
 @with_usd_core

@@ -12,7 +12,8 @@ Numbers = npt.NDArray[np.float64]
 
 DIRECT = 4e9
 """Multiplications an iteration up to which every vector meets every entry; beyond it entries form a tree."""
-_ROWS = 1 << 13
+AT_ONCE = 1 << 22
+"""Products of vectors and entries that are in memory together."""
 
 
 def scalar_codebook(values: Array, size: int = 256) -> Array:
@@ -119,7 +120,10 @@ def _assign(vectors: Array, entries: Array) -> Labels:
     squares = 0.5 * np.einsum("ij,ij->i", entries, entries)
     turned = np.ascontiguousarray(entries.T)
     labels = np.empty(len(vectors), np.intp)
-    for at in range(0, len(vectors), _ROWS):
-        part = slice(at, at + _ROWS)
-        labels[part] = (vectors[part] @ turned - squares).argmax(1)
+    rows = max(AT_ONCE // len(entries), 1)
+    for at in range(0, len(vectors), rows):
+        part = slice(at, at + rows)
+        products = vectors[part] @ turned
+        products -= squares
+        labels[part] = products.argmax(1)
     return labels

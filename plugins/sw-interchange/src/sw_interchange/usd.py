@@ -27,8 +27,11 @@ from sw_interchange.source import Source
 FRAMES = {"Y": "RUB", "Z": "RFU"}
 """Axes of a stage by its upAxis."""
 PROGRAM = Path(__file__).with_name("usd_process.py")
-MEGABYTES, SECONDS = (192, 24), (0.5, 0.1)
-"""Memory and processor time of usd-core, once loaded, for a file: of the smallest, and of each megabyte more."""
+MEGABYTES, SECONDS = (192, 24), (0.3, 0.06)
+"""Memory and processor time of usd-core, once loaded, for a file: of the smallest, and of each megabyte more. Text
+takes a quarter of this time."""
+WATCH, IDLE = 0.05, 0.25
+"""Seconds between looks at usd-core, and how long it may sleep: it waits for nothing but its own threads."""
 MAX_LINE = 1 << 20
 
 
@@ -83,15 +86,48 @@ def _by_usd_core(source: Source) -> tuple[dict[str, Any], memoryview]:
         else:
             path.write_bytes(source.data)
         command = [sys.executable, str(PROGRAM), str(path), str(megabytes), str(seconds)]
-        environment = {**os.environ, "PXR_WORK_THREAD_LIMIT": "1"}
-        found = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment, check=False)
-    line, _, _ = found.stdout[:MAX_LINE].partition(b"\n")
-    if found.returncode or not line:
+        answer = Path(folder) / "answer"
+        failed = _run(command, answer)
+        found = b"" if failed else answer.read_bytes()
+    line, _, _ = found[:MAX_LINE].partition(b"\n")
+    if failed or not line:
         raise BitstreamError(f"{source.name}: usd-core breaks off on it: it is damaged, or takes too much")
     told: dict[str, Any] = json.loads(line)
     if "refused" in told:
         raise BitstreamError(f"{source.name}: {told['refused']}")
-    return told, memoryview(found.stdout)[len(line) + 1 :]
+    return told, memoryview(found)[len(line) + 1 :]
+
+
+def _run(command: list[str], answer: Path) -> int:
+    """Run a program whose output goes into a file, until it ends or does nothing any more; its exit status."""
+    environment = {**os.environ, "PXR_WORK_THREAD_LIMIT": "1"}
+    with answer.open("wb") as out:
+        process = subprocess.Popen(command, stdout=out, stderr=subprocess.DEVNULL, env=environment)
+    used, slept = -1, 0.0
+    try:
+        while True:
+            try:
+                return process.wait(WATCH)
+            except subprocess.TimeoutExpired:
+                now = _asleep(process.pid)
+                used, slept = now, slept + WATCH if 0 <= now == used else 0.0
+                if slept >= IDLE:
+                    process.kill()
+    finally:
+        process.kill()
+        process.wait()
+
+
+def _asleep(pid: int) -> int:
+    """Processor time, in ticks, of a process all of whose threads sleep; -1 of another, and where Linux is not."""
+    try:
+        # Behind the name: the state, and as numbers 11 and 12 the time in the program and in the system.
+        threads = [path.read_text().rpartition(")")[2].split() for path in Path(f"/proc/{pid}/task").glob("*/stat")]
+    except OSError:
+        return -1
+    if not threads or any(state != "S" for state, *_ in threads):
+        return -1
+    return sum(int(told[11]) + int(told[12]) for told in threads)
 
 
 def _scene(data: memoryview, at: int, n: int, k: int) -> GaussianScene:
