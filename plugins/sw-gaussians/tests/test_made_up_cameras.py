@@ -86,6 +86,16 @@ def test_an_object_with_a_nook_is_no_room():
     assert found.kind == "object"
 
 
+@pytest.mark.parametrize(("grow", "kind"), [(True, "room"), (False, "object")])
+def test_where_gaussians_grow_with_the_distance_cameras_stood_between_them(grow, kind):
+    """A table and what is around it; two sides are open, so few directions are opaque."""
+    radii = torch.linspace(math.log(0.3), math.log(4), 3000).exp()[:, None]
+    directions = torch.nn.functional.normalize(ball(3000), dim=1)
+    points = (radii * directions)[directions[:, 0].abs() < 0.6]
+    sizes = 0.06 * points.norm(dim=1, keepdim=True) if grow else torch.full((len(points), 1), 0.1)
+    assert made(model_of(points, sizes)).kind == kind
+
+
 def test_no_camera_is_both_fitted_and_held_out():
     found = made(ROOM, fit=8, held_out=4)
     fitted = {camera.pose for camera in found.fit}

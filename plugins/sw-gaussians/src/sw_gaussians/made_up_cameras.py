@@ -54,6 +54,11 @@ ROOM_SHARE, OBJECT_SHARE = 0.75, 0.2
 """Share of the views that are inside, by kind."""
 ROOM = 0.6
 """Share of the solid angle that is opaque around a place in a room."""
+SURROUNDED = 3.0
+"""How many times as large as those of the middle the Gaussians far out are, where photographs were taken between them.
+Fox has 5.6, room 7.7; chair, lego and demo have less than 1."""
+FEWEST_COMPARED = 32
+"""Gaussians far out and in the middle; of fewer nothing is told."""
 TRIES = 8
 """Candidates per view before the least implausible one is taken."""
 MOST_JUDGED = 200_000
@@ -96,7 +101,8 @@ class _Judged:
 
     model       the weightiest ones
     points, middles, areas      [n,3], [n], [n]: places, middle scale, opacity times product of the two largest scales
-    beside      the same on a GPU; None: there is none
+    growth      how many times as large as those of the middle the Gaussians far out are
+    beside      the same as points, middles and areas on a GPU; None: there is none
     """
 
     model: GaussianModel
@@ -105,6 +111,7 @@ class _Judged:
     areas: Array
     rasterizer: Rasterizer
     options: RasterOptions
+    growth: float
     beside: tuple[Tensor, Tensor, Tensor] | None = None
 
     def opacity(self, camera: Camera) -> Array:
@@ -218,12 +225,26 @@ def _judged(model: GaussianModel, rasterizer: Rasterizer) -> tuple[_Judged, Exte
         sizes, on_gpu = scales[rows, 0], model.device.type != "cpu"
         measured = points[rows], areas[rows], sizes
         extent = extent_on_gpu(*measured) if on_gpu else extent_of(*(each.numpy() for each in measured))
+        growth = _growth(points[rows], scales[rows, 1], extent)
         if len(rows) > MOST_JUDGED:
             rows = rows[(-areas[rows]).argsort(stable=True)[:MOST_JUDGED]].sort().values
         options = RasterOptions(alpha=True, antialias=antialias_of(model), eps2d=eps2d_of(model))
         kept = points[rows], scales[rows, 1], areas[rows]
         arrays = (each.cpu().numpy() for each in kept)
-        return _Judged(select(model, rows), *arrays, rasterizer, options, kept if on_gpu else None), extent
+        return _Judged(select(model, rows), *arrays, rasterizer, options, growth, kept if on_gpu else None), extent
+
+
+def _growth(points: Tensor, middles: Tensor, extent: Extent) -> float:
+    """Median size of the Gaussians beyond 80 % of the visible area by that of those within half of it.
+
+    Gaussians shrink to about a pixel: from outside of an object all are as near, from within a room those far out are
+    farther than those around the camera.
+    """
+    radii = (points - torch.from_numpy(extent.center).to(points)).norm(dim=1)
+    far, near = middles[(radii > extent.r80) & (radii <= extent.r95)], middles[radii <= extent.r50]
+    if min(len(far), len(near)) < FEWEST_COMPARED:
+        return 1.0
+    return float(far.median() / near.median())
 
 
 def _cameras(
@@ -235,7 +256,10 @@ def _cameras(
     near = [_closed(seen) for place, seen in zip(places, maps, strict=True)
             if np.linalg.norm(place - extent.center) <= extent.r50]  # fmt: skip
     kind = "object"
-    if _is_room(near):
+    if judged.growth > SURROUNDED:
+        kind = "room"
+        places, maps = _spread_out(_open_places(judged, extent, extent.r50, count), extent, count)
+    elif _is_room(near):
         middle = _open_places(judged, extent, extent.r50, count)
         closed = [_closed(seen) for _, seen in middle]
         if _is_room(closed):  # not just one nook of an object, as below the seat of a chair
