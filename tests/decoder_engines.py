@@ -60,8 +60,8 @@ class Wasmtime:
         self.modules = {path.name: wasmtime.Module.from_file(self.engine, str(path)) for path in FOLDER.glob("*.wasm")}
         self.tables = (FOLDER / "exact_tables.zlib").read_bytes()
 
-    def told(self, data: bytes, memory: int = -1, packets: int = 0) -> Told:
-        """Hash or reason; `memory` is the most bytes that the instance may have."""
+    def told(self, data: bytes, memory: int = -1, packets: int = 0, then: Sequence[int] = ()) -> Told:
+        """Hash or reason; `memory` is the most bytes that the instance may have, and `then` packets to go on to."""
         store = self.api.Store(self.engine)
         store.set_limits(memory_size=memory)
         exports = self.api.Instance(store, self.modules[module_for(data)], []).exports(store)
@@ -74,6 +74,8 @@ class Wasmtime:
             exports["memory"].write(store, data, exports["swz_input"](store, len(data)))
             exports["memory"].write(store, self.tables, exports["swz_tables"](store, len(self.tables)))
             exports["swz_decode"](store, packets)
+            for further in then:
+                assert exports["swz_go_on"](store, further) == 1
         except self.api.Trap:
             return None, text(exports["swz_refusal"](store))
         return text(exports["swz_hash"](store)), None

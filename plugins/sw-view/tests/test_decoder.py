@@ -38,6 +38,7 @@ ROOT = Path(__file__).parents[3]
 THREE = ROOT / "build" / "three" / "node_modules"
 GOLDEN = sorted((ROOT / "tests" / "golden").glob("*.swz"))
 PACKETS = ROOT / "tests" / "golden" / "3dgs_packets_v1.swz"
+WISP_PACKETS = PACKETS.with_name("wisp_packets_v2.swz")
 COVERED = [path for path in GOLDEN if covers(ContainerReader.open(path))]
 WITH_CUTS = [path for path in COVERED if ContainerReader.open(path).cuts]
 needs_wasmtime = pytest.mark.skipif(importlib.util.find_spec("wasmtime") is None, reason="wasmtime is not installed")
@@ -195,6 +196,31 @@ def test_a_file_with_cuts_is_read_up_to_each_of_them(wasmtime, path):
         assert wasmtime.told(data, packets=number) == (wanted, None)
         assert wasmtime.told(data[: reader.header_bytes + cut.bytes]) == (wanted, None)
     assert wasmtime.told(data, packets=99)[1] == f"it has {len(reader.cuts)} packets, 99 are asked for"
+
+
+@needs_wasmtime
+@pytest.mark.parametrize("then", [(0,), (2, 0), (2, 3), (3, 3)], ids=str)
+def test_a_file_of_wisp_goes_on_behind_its_first_packet(wasmtime, then):
+    data = WISP_PACKETS.read_bytes()
+    assert wasmtime.told(data, packets=1, then=then) == wasmtime.told(data, packets=then[-1])
+
+
+@needs_wasmtime
+def test_a_damaged_packet_is_named_when_the_file_goes_on(wasmtime):
+    data = WISP_PACKETS.read_bytes()
+    data = data[:-1] + bytes([data[-1] ^ 1])
+    first, whole = wasmtime.told(data, packets=1, then=(0,)), wasmtime.told(data)
+    assert first == whole
+    assert "CRC-32 does not match" in whole[1]
+
+
+@needs_node
+def test_arrays_that_went_on_are_those_of_the_whole():
+    paths = [*WITH_CUTS, COVERED[0]]
+    script = SCRIPT.with_name("refined_files.mjs")
+    done = subprocess.run(["node", script, *paths], capture_output=True, text=True, check=True)
+    wanted = [[[False, True], [True, True]] if path in WITH_CUTS else [[True, True]] for path in paths]
+    assert [json.loads(line) for line in done.stdout.splitlines()] == wanted
 
 
 @needs_node
