@@ -170,8 +170,10 @@ def test_a_file_with_cuts_is_shown_coarse_first(browser, tmp_path, monkeypatch, 
     with monkeypatch.context() as patched:
         patched.setattr("sw_view.page_file.pack", lambda _: replace(packed, text="a" * 400_000))
         write_page(model, pages[0], About("toy"), None)
-    pause = "await new Promise(r => setTimeout(r, 500)); tell(decoded(0),"
-    pages[0].write_text(pages[0].read_text().replace("tell(decoded(0),", pause))
+    text, telling = pages[0].read_text(), "tell(plain(arrays), facts, eye, whole);"
+    assert telling in text
+    pause = f"{{ if (whole) await new Promise(r => setTimeout(r, 500)); {telling} }}"
+    pages[0].write_text(text.replace(telling, pause))
     added = browser.send("Page.addScriptToEvaluateOnNewDocument", source=NOTES_STATES)
     browser.open(at(pages[0].as_uri()), width=800)
     wait_for(browser, "document.documentElement.dataset.state === 'drawn'")

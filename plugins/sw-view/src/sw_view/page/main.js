@@ -138,7 +138,7 @@ function begin(gaussians, { whole, look, eye: seenFrom }) {
     next = { gaussians: finer, after: number };
     whole = wanted = true;
     looking = null, seenFrom = place;
-    sort();  // and draws when the order is there
+    if (!drawing) sort();  // and draws when the order is there
     watch();
   };
 }
