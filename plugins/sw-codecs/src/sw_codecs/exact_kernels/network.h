@@ -28,9 +28,10 @@ void take_inputs(const T* inputs, int64_t width, int64_t stride, int64_t n, int6
 // The outputs of a layer between others as rows.
 inline void take_outputs(const Tiles& l, int64_t t, const double* sums, int64_t leak, Rows& rows) {
   const Vec slope = all(static_cast<double>(leak) / 4096);  // times an integer below 2^41: exact
+  const int64_t outputs = l.outputs - t * TILE < TILE ? l.outputs - t * TILE : TILE;
   Narrow most{};
   for (int64_t r = 0; r < BLOCK; ++r)
-    for (int v = 0; v < TILE; v += LANES) {
+    for (int v = 0; v < outputs; v += LANES) {
       Vec x = shifted(load(sums + r * TILE + v));
       if (leak) x = x < all(0) ? floor_of(x * slope) : x;
       const Narrow whole = __builtin_convertvector(clamped(x, leak ? -ACTIVATION_LIMIT : 0, ACTIVATION_LIMIT), Narrow);
@@ -84,7 +85,7 @@ void over_blocks(const Packed& packed, int64_t rows, int64_t leak, const Paralle
             take_outputs(l, t, sums.data, leak, to);
           else
             for (int64_t r = 0; r < BLOCK; ++r)
-              for (int v = 0; v < TILE; v += LANES)
+              for (int64_t v = 0; v < TILE && t * TILE + v < l.outputs; v += LANES)
                 store(outputs.data + r * stride + t * TILE + v, shifted(load(sums.data + r * TILE + v)));
         }
       }

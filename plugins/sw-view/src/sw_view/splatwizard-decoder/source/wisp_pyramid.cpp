@@ -224,17 +224,17 @@ struct Pyramid final : Context {
     if (piece == 0) return;
     const int64_t first = BLOCKS[block].first, n = PIECES[block][piece].first - first, c = PIECES[block][piece].width();
     const int64_t* w = ties[block][piece].data;
-    int64_t residuals[LATENTS.end - LATENTS.first], large[LATENTS.end - LATENTS.first];
+    int64_t sums[2 * (LATENTS.end - LATENTS.first)] = {};
+    bool any = false;
     for (int64_t i = 0; i < n; ++i) {
       const int64_t at = NUMBERS * row + first + i, k = splats.index[at], size = k < 0 ? -k : k;
-      residuals[i] = clamped(k * splats.multiplier[at], -VALUE_LIMIT, VALUE_LIMIT);
-      large[i] = clamped(size * sizes[table_of(splats.scale[at], 0)], 0, 4 * UNIT);
+      if (k == 0) continue;  // mostly
+      any = true;
+      const int64_t residual = clamped(k * splats.multiplier[at], -VALUE_LIMIT, VALUE_LIMIT);
+      const int64_t large = clamped(size * sizes[table_of(splats.scale[at], 0)], 0, 4 * UNIT);
+      for (int64_t j = 0; j < c; ++j) sums[j] += w[n * j + i] * residual, sums[c + j] += w[n * (c + j) + i] * large;
     }
-    for (int64_t j = 0; j < 2 * c; ++j) {
-      int64_t sum = 0;
-      for (int64_t i = 0; i < n; ++i) sum += w[n * j + i] * (j < c ? residuals : large)[i];
-      (j < c ? mean : scale - c)[j] += sum >> 12;
-    }
+    for (int64_t j = 0; any && j < c; ++j) mean[j] += sums[j] >> 12, scale[j] += sums[c + j] >> 12;
   }
 
   void learn(Span columns, Rows rows, const Splats& splats) override {
