@@ -21,7 +21,7 @@ from splatwizard_core.api import GaussianModel, create_method
 from splatwizard_core.tooling import encode as encode_model
 from sw_codecs.models.band_context import suitable_classes
 from sw_codecs.models.settings import QuantizedSettings
-from sw_compress.rounding import Rounding, Steps, cells_of, entropy_bits, equal_classes, grid_of
+from sw_compress.rounding import Rounding, Steps, blocks, cells_of, entropy_bits, equal_classes, grid_of
 from sw_compress.rows import IMPORTANCE, select
 
 if TYPE_CHECKING:
@@ -165,8 +165,9 @@ class Quantized:
 def _position_sizes(model: GaussianModel, levels: NDArray[np.float64]) -> NDArray[np.float64]:
     """Bytes of the positions at ascending levels."""
     finest, means = int(POSITION_BITS - levels[0]), model.means.detach()
-    cells = cells_of(means, replace(grid_of(means), bits=finest)).long()
-    bits = octree_bits(interleave(cells).sort().values, finest)
+    grid, parts = replace(grid_of(means), bits=finest), blocks(len(means), means.device)
+    codes = torch.cat([interleave(cells_of(means[rows], grid).long()) for rows in parts])
+    bits = octree_bits(codes.sort().values, finest)
     return np.array([bits[int(POSITION_BITS - level)] / 8 for level in levels])
 
 

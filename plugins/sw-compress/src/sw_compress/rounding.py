@@ -79,6 +79,12 @@ class Rounding:
         place.copy_(self.parameter(name, steps, place.detach()))  # of itself, but for positions
         return whole
 
+    def overwrite(self, steps: Steps) -> GaussianModel:
+        """Bring the model itself to these steps, where there is no memory for two: nothing else can be asked then."""
+        for name in NAMES.values():
+            self.change(self.model, name, steps)
+        return self.model
+
     def _of(self, raw: dict[str, Tensor]) -> GaussianModel:
         return like(self.model, type(self.model)(**raw, active_sh_degree=self.model.active_sh_degree))
 

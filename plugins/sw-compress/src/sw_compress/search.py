@@ -51,6 +51,11 @@ class Search:
     _known: dict[int, tuple[GaussianModel, list[Curve]]] = field(default_factory=dict)
     _coarsest: tuple[float, int, list[Curve]] | None = None
 
+    @property
+    def is_tight(self) -> bool:
+        """Whether parts are made anew once one is chosen: memory of a CPU is for one beside the model."""
+        return self.model.device.type == "cpu" and self.model.num_rows > KEPT and len(self.parts()) > 1
+
     def parts(self) -> list[int]:
         """Numbers of Gaussians to try, falling."""
         return parts_of(self.model.num_rows, self.count)
@@ -137,27 +142,30 @@ class Choice:
 def for_size(search: Search, budget: float) -> Choice | None:
     """The best picture in a file of an estimated `budget` bytes; None where nothing is so small."""
     best: tuple[int, list[Curve], Allocation] | None = None
-    held: Choice | None = None
-    best_error, worse, choice = math.inf, 0, None
+    held: GaussianModel | None = None
+    best_error, worse = math.inf, 0
     for count in search.parts():
-        choice = None  # its Gaussians go before the next ones are made
         choice, error, last = _looked_at(search, count, budget)
         if choice is not None:
             if error < best_error:
                 best, best_error, worse = (count, choice.curves, choice.allocation), error, 0
-                held = choice if choice.model.device.type != "cpu" else None
+                held = None if search.is_tight else choice.model
             else:
-                choice, worse = None, worse + 1
+                worse += 1
+            choice = None  # its Gaussians go before the next ones are made
         if worse == PATIENCE or last:
             break
-    if best is None or choice is not None or held is not None:
-        return choice or held
+    if best is None:
+        return None
     count, curves, allocation = best
-    return Choice(search.gaussians(count), curves, allocation)
+    return Choice(search.gaussians(count) if held is None else held, curves, allocation)
 
 
 def _looked_at(search: Search, count: int, budget: float) -> tuple[Choice | None, float, bool]:
-    """The best that so many Gaussians give, its error, and whether no fewer may stay."""
+    """The best that so many Gaussians give, its error, and whether no fewer may stay.
+
+    Where memory is tight its model is rounded, and not to be coded.
+    """
     part, curves = search.part(count)
     give_back()
     search.note_coarsest(count, curves)
@@ -166,7 +174,12 @@ def _looked_at(search: Search, count: int, budget: float) -> tuple[Choice | None
     if found is None:
         return None, math.inf, last
     choice = Choice(part, curves, found)
-    error = search.pictures.error(search.coder.rounded(part, found.levels))
+    rounding, steps = search.coder.rounding(part), search.coder.whole_steps(found.levels)
+    in_place = search.is_tight and part is not search.model
+    rounded = rounding.overwrite(steps) if in_place else rounding.model_at(steps)
+    del rounding
+    search.coder.forget()  # what it rounds by is not needed to draw
+    error = search.pictures.error(rounded)
     search.tried.append((part.num_rows, choice.bytes, decibels(error)))
     return choice, error, last
 
