@@ -231,8 +231,8 @@ def rows_that_fit(count: int, whole: int, size: int, written: Callable[[int], in
             under = found
             if found[1] >= FILLED * size:
                 break
-        if under[0] and (over[0] - 1 - under[0]) * under[1] / under[0] < FILLED * size - under[1]:
-            break  # sizes jump there: no number between fills it
+        if under[0] and (over[0] - under[0]) * under[1] / under[0] < min((1 - FILLED) * size, FILLED * size - under[1]):
+            break  # sizes jump there: no number between fills it, or is much nearer
         start = under if under[0] else (0, fixed)
         slope = (over[1] - start[1]) / (over[0] - start[0])
         wanted = start[0] + (GOAL * size - start[1]) / max(slope, 1e-9)
