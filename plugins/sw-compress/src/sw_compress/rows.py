@@ -19,7 +19,7 @@ def select(model: GaussianModel, rows: Tensor) -> GaussianModel:
     known = getattr(model, IMPORTANCE, None)
     if known is not None:
         setattr(part, IMPORTANCE, known[rows])
-    return part
+    return bare(part)
 
 
 @torch.no_grad()
@@ -36,4 +36,12 @@ def with_degree(model: GaussianModel, degree: int) -> GaussianModel:
 def like(model: GaussianModel, other: GaussianModel) -> GaussianModel:
     """`other`, fixed, with the facts that the file of `model` told."""
     other.origin = model.origin
-    return other.eval().requires_grad_(False)
+    return bare(other.eval().requires_grad_(False))
+
+
+def bare(model: GaussianModel) -> GaussianModel:
+    """The model without what a training counts for each Gaussian, 12 bytes of each."""
+    for name in model.ROWS:
+        if name not in model.RAW:
+            setattr(model, name, getattr(model, name).new_zeros(0))
+    return model

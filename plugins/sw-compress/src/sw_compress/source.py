@@ -12,7 +12,7 @@ from sw_gaussians.surfels import refuse_surfels
 
 from splatwizard_core.api import GaussianModel, SceneError, UserInputError
 from splatwizard_core.tooling import bytes_with_named, existing_file, open_model, read_gaussians
-from sw_compress.rows import select
+from sw_compress.rows import bare, select
 
 if TYPE_CHECKING:
     from splatwizard_core.api import PluginManager
@@ -52,7 +52,7 @@ def open_source(given: str | os.PathLike[str] | GaussianModel, plugins: PluginMa
         return _source("scene", given.to(device), None)
     path = existing_file(str(given))
     if plugins.importers.of_suffix(path) is not None:
-        return _source(path.name, read_gaussians(path, plugins).to(device), bytes_with_named(path))
+        return _source(path.name, bare(read_gaussians(path, plugins)).to(device), bytes_with_named(path))
     with path.open("rb") as file:
         is_ours = path.suffix.lower() == ".swz" or file.read(4) == b"SPWZ"
     if not is_ours:
@@ -63,7 +63,7 @@ def open_source(given: str | os.PathLike[str] | GaussianModel, plugins: PluginMa
         raise UserInputError(
             f"{path.name}: Gaussians of method '{reader.method}' depend on the camera: `sw bake` makes explicit ones"
         )
-    return _source(path.name, model, path.stat().st_size)
+    return _source(path.name, bare(model), path.stat().st_size)
 
 
 def _source(name: str, model: GaussianModel, file_bytes: int | None) -> Source:
