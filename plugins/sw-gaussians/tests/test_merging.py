@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from sw_gaussians import face, simplifying
+from sw_gaussians import face, merging, simplifying
 from sw_gaussians.merge_costs import closeness, columns_of, prices
 from sw_gaussians.merging import Splats, covariances, merge_groups, surface
 from sw_gaussians.native import GAUSSIANS
@@ -221,6 +221,18 @@ def test_levels_halve_down_to_a_64th_or_20_000():
     assert level_counts(10_000_000)[-1] == 156_250
     assert level_counts(30_000) == [30_000]
     assert level_counts(9, 3) == [9, 5, 3]
+
+
+@pytest.mark.parametrize("bands", [0, 3, 15])
+@pytest.mark.parametrize("count", [0, 1, 20, 60, 99, 100])
+def test_coefficients_of_some_rows_are_theirs_wherever_they_lie(monkeypatch, bands: int, count: int):
+    monkeypatch.setattr(merging, "ROWS_AT_ONCE", 7)
+    random = torch.Generator().manual_seed(0)
+    sh, rows = torch.randn(100, 1 + bands, 3, generator=random), torch.randperm(100, generator=random)[:count]
+    dc, rest = merging.sh_of(sh.clone(), rows)
+    assert torch.equal(dc, sh[rows, :1])
+    assert torch.equal(rest, sh[rows, 1:])
+    assert rest.is_contiguous()
 
 
 @pytest.mark.parametrize("bands", [1, 4])

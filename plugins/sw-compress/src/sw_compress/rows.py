@@ -44,4 +44,5 @@ def bare(model: GaussianModel) -> GaussianModel:
     for name in model.ROWS:
         if name not in model.RAW:
             setattr(model, name, getattr(model, name).new_zeros(0))
+    model.ROWS = model.RAW
     return model

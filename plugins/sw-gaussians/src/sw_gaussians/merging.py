@@ -23,6 +23,9 @@ THOMSEN = 1.6075
 ROWS_AT_ONCE = 1 << 16
 """Rows of spherical harmonics that are copied together."""
 
+COEFFICIENTS_AT_ONCE = 4
+"""Spherical harmonics that are put into another order together: they are most of a Gaussian."""
+
 Rule = Literal["ink", "mass"]
 
 
@@ -73,15 +76,33 @@ def splats_of(model: GaussianModel, rows: Tensor | None = None) -> Splats:
 
 
 def model_of(splats: Splats, rows: Tensor, like: GaussianModel) -> GaussianModel:
-    """A model in float32 of some Gaussians, fixed, with what the file of `like` told; shares no memory with them."""
+    """A model in float32 of some Gaussians, fixed, with what the file of `like` told; overwrites their SH."""
     opacities = splats.opacities[rows].double().clamp(1e-6, 1 - 1e-6)
     scales = splats.scales[rows].double().clamp(1e-38, 3e38)
-    # Spherical harmonics are copied once: they are most of what there is.
-    dc, rest = (splats.sh[:, some].index_select(0, rows).float() for some in (slice(1), slice(1, None)))
+    dc, rest = sh_of(splats.sh, rows)
     raw = (splats.means[rows], dc, rest, torch.logit(opacities), scales.log(), splats.quats[rows])
     model = GaussianModel(*(values.float() for values in raw))
     model.origin = like.origin
     return model.eval().requires_grad_(False)
+
+
+def sh_of(sh: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+    """The first band [n,1,3] and the others [n,K-1,3] of some rows of coefficients [N,K,3], which it overwrites.
+
+    Where most rows stay, the others lie in the memory of all: they are most of a Gaussian, so a copy would be the
+    largest thing beside them.
+    """
+    n, bands = len(rows), sh.shape[1] - 1
+    dc = sh[:, :1].index_select(0, rows)
+    if 2 * n <= len(sh) or not sh.is_contiguous():
+        return dc, sh[:, 1:].index_select(0, rows)
+    for some in sh.split(COEFFICIENTS_AT_ONCE, dim=1):
+        some[:n] = some[rows]
+    rest = sh.view(-1)[: 3 * bands * n].view(n, bands, 3)
+    for start in range(0, n, ROWS_AT_ONCE):  # what is written lies before what is still to be read
+        part = slice(start, min(start + ROWS_AT_ONCE, n))
+        rest[part] = sh[part, 1:].clone()
+    return dc, rest
 
 
 def surface(scales: Tensor) -> Tensor:
