@@ -84,7 +84,8 @@ def _reduced(
     pool = _Pool.of(splats_of(model, rows[curve]), weights)
     near, wave = NEAR, 0
     while (n := len(pool.order)) > max(count, 1):
-        trim()
+        if pool.table.device.type == "cpu":
+            trim()
         pool.follow_curve(wave)
         pairs = _wave(pool, near, wave)
         pairs = pairs[: min(n - count, math.ceil(TAKEN * len(pairs)))]
