@@ -9,7 +9,6 @@ are missing, unfinished or failed. Families, each at r1, r3, r5 and two points b
 
 wisp        as its preset has it
 half        --cap 1.6 times as many grown, 0.81 caps begin at factor 1: the worthier half
-priced      half, and the price of a bit by the number of training views: --views of 100
 
 Rungs, at r3 and once: half with
 
@@ -42,7 +41,6 @@ from sweep_cells import Cell, add_options, chosen, print_outcomes, run_cells
 RATES = ("r1", "r3", "r5")
 BEYOND = {"high": (1.25e-5, 1.6, 0.3), "highest": (6e-6, 2.0, 0.25)}
 """Name of a point beyond r5 -> lambda, factor of the cap, eta."""
-LAMBDAS = {"r1": 4e-4, "r3": 1e-4, "r5": 2.5e-5}
 COLUMNS = ("PSNR dB", "of training views", "SSIM", "bytes", "splats", "train s", "encode s", "decode s")
 BASELINES = {"hac-plus": (0.50, RATES), "cat-3dgs": (0.75, ("r1", "r3", "r6"))}
 """Method -> bar of the mean ratio, and its rate points."""
@@ -66,31 +64,24 @@ RUNGS: Mapping[str, Sequence[str]] = {
 }
 
 
-def families(cap: int, views: int) -> dict[str, list[str]]:
+def families(cap: int) -> dict[str, list[str]]:
     """Family -> its values."""
-    half = [f"{GROWN}.cap={round(1.6 * cap)}", f"budget.cap={round(0.54 * cap)}"]
-    return {"wisp": [], "half": half, "priced": [*half, f"views={views}"]}
+    return {"wisp": [], "half": [f"{GROWN}.cap={round(1.6 * cap)}", f"budget.cap={round(0.54 * cap)}"]}
 
 
-def points(family: str, scene: str, images: str, seed: int, sets: Sequence[str]) -> list[Cell]:
+def points(family: str, scene: str, images: str, seed: int, values: Sequence[str]) -> list[Cell]:
     """A family at its rate points and the two beyond."""
-    price = math.prod(100 / int(each.partition("=")[2]) for each in sets if each.startswith("views="))
-    values = [each for each in sets if not each.startswith("views=")]
-    found = []
-    for rate in RATES:
-        own = [f"rate_term.lambda_={LAMBDAS[rate] * price:.3g}"] if price != 1 else []
-        label = family if family == "wisp" or not own else f"{family}-{rate}"
-        found.append(Cell(label, "wisp", scene, rate, seed, images=images, sets=(*values, *own)))
+    found = [Cell(family, "wisp", scene, rate, seed, images=images, sets=tuple(values)) for rate in RATES]
     for name, (weight, factor, eta) in BEYOND.items():
-        own = [f"rate_term.lambda_={weight * price:.3g}", f"budget.cap_factor={factor}", f"positions.eta={eta}"]
+        own = (f"rate_term.lambda_={weight}", f"budget.cap_factor={factor}", f"positions.eta={eta}")
         found.append(Cell(f"{family}-{name}", "wisp", scene, "r5", seed, images=images, sets=(*values, *own)))
     return found
 
 
-def cells_of(scene: str, images: str, cap: int, views: int, seeds: int) -> dict[str, list[Cell]]:
+def cells_of(scene: str, images: str, cap: int, seeds: int) -> dict[str, list[Cell]]:
     """Row group -> its cells: families, rungs, baselines."""
     found: dict[str, list[Cell]] = {}
-    every = families(cap, views)
+    every = families(cap)
     for seed in range(seeds):
         for family, sets in every.items():
             found.setdefault(family, []).extend(points(family, scene, images, seed, sets))
@@ -163,7 +154,7 @@ def print_ratios(groups: Mapping[str, Sequence[Cell]], out: Path, console: Conso
     """Print the mean ratio of each family and baseline, seed 0, and what is not reached."""
     for method, (bar, _) in BASELINES.items():
         theirs = {cell.rate: measured(cell, out) for cell in groups[method] if cell.seed == 0}
-        for family in families(0, 100):
+        for family in families(0):
             ours = [each for cell in groups[family] if cell.seed == 0 for each in measured(cell, out)]
             if not ours or not any(theirs.values()):
                 continue
@@ -184,10 +175,9 @@ def main() -> int:
     parser.add_argument("--images", default="", help="folder of pictures (default: the scene's own)")
     parser.add_argument("--cap", type=int, required=True, help="wisp's own for the scene: 31.25 times the root of its "
                         "training pixels")  # fmt: skip
-    parser.add_argument("--views", type=int, default=100, help="training views, for `priced` (default: 100)")
     parser.add_argument("--seeds", type=int, default=1, help="(default: 1)")
     args = parser.parse_args()
-    groups = cells_of(args.scene, args.images, args.cap, args.views, args.seeds)
+    groups = cells_of(args.scene, args.images, args.cap, args.seeds)
     cells = chosen((cell for each in groups.values() for cell in each), args)
     console = Console(width=200)
     outcomes = run_cells(cells, args.out, args)

@@ -24,6 +24,7 @@ from sw_wisp.conversion import kept_rows
 from sw_wisp.method import Wisp
 from sw_wisp.removal import unworthy
 from sw_wisp.rounding import FINAL, HARD, NOISE, SOFT, Rounding, soft_round
+from sw_wisp.stage import priced_pixels
 
 PLAN = """\
 Stage | Task                             | Plan
@@ -102,6 +103,11 @@ def test_lambda_rises_over_its_ramp(plugins):
     assert stage.price(2_000) == 0
     assert stage.price(3_000) == pytest.approx(stage.price() / 2)
     assert stage.price(4_000) == stage.price(17_000) == stage.price()
+
+
+def test_a_bit_is_paid_by_the_pixels_of_all_training_pictures():
+    assert priced_pixels(views_of(800, 800, 100)) == 640_000
+    assert priced_pixels(views_of(400, 266, 255)) == pytest.approx(2.55 * 106_400)
 
 
 def test_rate_points_and_presets_resolve():
@@ -222,7 +228,7 @@ def test_estimated_bits_are_those_of_the_file(whole):
 
 
 def test_more_lambda_leaves_fewer_splats_and_a_smaller_file(train):
-    few, many = (train(context__kind="none", rate_term__lambda_=value) for value in (3e-3, 1e-5))
+    few, many = (train(context__kind="none", rate_term__lambda_=value) for value in (1e-4, 3e-7))
     assert few[1].num_rows < many[1].num_rows
     assert len(file_of(*few)) < len(file_of(*many))
 

@@ -21,7 +21,12 @@ class Budget(Params):
 
 
 class RateTerm(Params):
-    """The bits in the loss: lambda times bits of the whole file over pixels of one picture."""
+    """The bits in the loss: lambda times bits of the whole file over the pixels of all training pictures, in hundreds.
+
+    So a bit is as dear as the errors that it can take away: of more pictures, and of larger ones, it is cheaper.
+    """
+
+    DEFAULTS: ClassVar[int] = 1
 
     lambda_: float = Field(1e-4, ge=0, description="weight: what the rate points set")
     start: int = Field(2_000, ge=0, description="step at which it begins to rise from 0")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -52,6 +52,8 @@ NETWORKS = ("network", "rate")
 NETWORK_EPS = 1e-8
 FITS = 2
 """Times that the networks are fitted before the first bits are counted, each to what the one before left."""
+PRICED_VIEWS = 100
+"""Training pictures that the lambda of the rate points are for: a bit is paid once, errors show in all of them."""
 SENSITIVE_VIEWS = 64
 """Most views that squared slopes are measured over inside a training."""
 
@@ -76,7 +78,7 @@ class WispStage(Stage):
     def __init__(self, opt: WispConfig) -> None:
         super().__init__(opt)
         self.config = opt
-        self._pixels = 1.0  # of a training picture, in the mean
+        self._pixels = 1.0  # of all training pictures, in hundreds of pictures
 
     # Bounds of this run
 
@@ -109,7 +111,7 @@ class WispStage(Stage):
         model, scene = context.model, context.scene
         self._rasterizer = context.rasterizer
         views = scene.train
-        self._pixels = sum(view.camera.width * view.camera.height for view in views) / len(views)
+        self._pixels = priced_pixels(views)
         if not isinstance(model, GaussianModel):
             raise TypeError(f"wisp starts from explicit Gaussians, not from a {type(model).__name__}")
         background = scene.background.to(model.device)
@@ -408,7 +410,7 @@ class WispStage(Stage):
         model.rate.base_steps[LATENTS.columns] *= factors
 
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
-        """The photometric loss, lambda times the bits of the file over the pixels of a picture, the mean opacity."""
+        """The photometric loss, the bits of the file at their price, the mean opacity."""
         assert isinstance(model, WispModel)
         config = self.config
         truth = view.image(background, result.image.device)
@@ -437,6 +439,11 @@ class WispStage(Stage):
                 psnr = psnr_of_prefixes(model, scene.train, self._rasterizer, background)
             model.layers = replace(model.layers, psnr=psnr)
         return model
+
+
+def priced_pixels(views: Sequence[View]) -> float:
+    """Return the pixels that bits are paid by: of all training pictures, in hundreds of pictures."""
+    return sum(view.camera.width * view.camera.height for view in views) / PRICED_VIEWS
 
 
 def some_views(views: list[View], draws: torch.Generator) -> list[View]:
