@@ -25,6 +25,7 @@ from sw_wisp.method import Wisp
 from sw_wisp.removal import unworthy
 from sw_wisp.rounding import FINAL, HARD, NOISE, SOFT, Rounding, soft_round
 from sw_wisp.stage import priced_pixels
+from sw_wisp.worth import Worth
 
 PLAN = """\
 Stage | Task                             | Plan
@@ -44,7 +45,10 @@ Pre   | measure rate model               | range(15501, 17000, 100)
 Pre   | fix integers                     | 17000
 Post  | remove by rate and distortion    | range(2500, 10501, 1000)"""
 
-SHORT = {"iterations": 90, "scale_schedule": True, "prune.every": 4_000, "context.rebuild": 1_000, "context.fit": 20}
+SHORT = {
+    "iterations": 90, "scale_schedule": True, "prune.every": 4_000, "context.rebuild": 1_000, "context.fit": 20,
+    "rate_term.lambda_": 3e-6,  # of three small pictures
+}  # fmt: skip
 
 
 def configured(plugins, **values):
@@ -125,13 +129,14 @@ def test_there_is_no_start_from_points(plugins, toy):
 
 
 def test_conversion_keeps_the_worthiest_up_to_the_cap():
-    costs = torch.tensor([5.0, -1.0, 3.0, 0.0, 2.0, -7.0, 4.0, 1.0, 6.0, 9.0], dtype=torch.float64)
+    change = torch.tensor([5.0, 0.1, 3.0, 0.0, 2.0, 7.0, 4.0, 1.0, 6.0, 9.0], dtype=torch.float64)
+    cost = change.clone()
+    cost[torch.tensor([1, 5, 7])] = -1.0
     config = apply_overrides(WispConfig(), {"budget.cap": 4, "budget.cap_factor": 0.5}, source="test")
     views = views_of(8, 8)
-    assert kept_rows(costs, views, config).tolist() == [0, 8, 9]  # 1.5 x 0.5 x 4
-    rest = kept_rows(costs, views, WispConfig()).tolist()
-    assert len(rest) == 8  # three do harm, two of ten may go
-    assert 5 not in rest
+    assert kept_rows(Worth(change, cost, 1.0), views, config).tolist() == [5, 8, 9]  # 1.5 x 0.5 x 4
+    rest = kept_rows(Worth(change, cost, 1.0), views, WispConfig()).tolist()
+    assert rest == [0, 2, 4, 5, 6, 7, 8, 9]  # the pictures are as good without four, two of ten may go
 
 
 def views_of(width, height, count=1):
@@ -143,7 +148,7 @@ def test_without_a_cap_as_many_begin_as_the_pixels_ask_for():
     assert cap_for(views_of(800, 800, 100)) == 250_000
     assert cap_for(views_of(1, 1)) == 31
     costs = torch.linspace(1, 2, 100, dtype=torch.float64)
-    assert len(kept_rows(costs, views_of(2, 2), WispConfig())) == round(1.5 * 0.8 * 62)
+    assert len(kept_rows(Worth(costs, costs, 1.0), views_of(2, 2), WispConfig())) == round(1.5 * 0.8 * 62)
 
 
 def test_conversion_keeps_the_pictures(train, toy, rasterizer):

@@ -17,7 +17,7 @@ class Budget(Params):
 
     cap: int | None = Field(None, ge=1, description="most splats, times `budget.cap_factor`; None: by training pixels")
     cap_factor: float = Field(0.8, gt=0, le=10, description="what the rate points set")
-    worthless: float = Field(0.2, ge=0, lt=1, description="largest share that is dropped first, as the pictures gain")
+    worthless: float = Field(0.2, ge=0, lt=1, description="largest share dropped first, of as many as do harm")
 
 
 class RateTerm(Params):
@@ -73,7 +73,7 @@ class Positions(Params):
 class Prune(Params):
     """Removal of splats that cost more bits than they are worth."""
 
-    rd: bool = Field(True, description="remove where the exact cost of removal is below lambda times the bits")
+    rd: bool = Field(True, description="remove where the change of the pictures costs less than lambda times the bits")
     start: int = Field(2_500, ge=1, description="step of the first removal")
     stop: int = Field(10_501, ge=1, description="no removal from this step on")
     every: int = Field(1_000, ge=1, description="steps between removals")

@@ -17,7 +17,7 @@ from sw_wisp.numbers import LATENTS
 from sw_wisp.positions import MARGIN, middle_scales
 from sw_wisp.rate_model import PyramidRate, StaticRate
 from sw_wisp.shape import log_covariance
-from sw_wisp.worth import slopes, worth
+from sw_wisp.worth import Worth, slopes, worth
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Rasterizer, View
@@ -33,28 +33,28 @@ WIDEST_RATIO = 9.7
 looks the same."""
 
 
-def kept_rows(costs: Tensor, views: Sequence[View], config: WispConfig) -> Tensor:
-    """Return the rows [M] int64, ascending, that begin: as many as the cap lets of the worthiest, few that do harm.
+def kept_rows(worth: Worth, views: Sequence[View], config: WispConfig) -> Tensor:
+    """Return the rows [M] int64, ascending, that begin: the worthiest, as many as the cap lets.
 
-    costs   [N] of removal: at most 0 where the pictures are as good without
+    As many go before as there are without which the pictures are as good, up to a share.
     """
-    n = len(costs)
+    n = len(worth.change)
     cap = round(HEAD_ROOM * (config.budget.cap or cap_for(views)) * config.budget.cap_factor)
-    harmful = min(int((costs <= 0).sum()), int(config.budget.worthless * n))
-    keep = max(1, min(n - harmful, cap))
-    return torch.sort(costs, descending=True, stable=True).indices[:keep].sort().values
+    needless = min(int((worth.cost <= 0).sum()), int(config.budget.worthless * n))
+    keep = max(1, min(n - needless, cap))
+    return torch.sort(worth.change, descending=True, stable=True).indices[:keep].sort().values
 
 
-def within_reach(means: Tensor, costs: Tensor) -> Tensor:
+def within_reach(means: Tensor, worth: Tensor) -> Tensor:
     """Tell [N] which splats lie within twice the distance from their middle that holds all but FAR_SHARE of the worth.
 
     means   [N,3]
-    costs   [N] of removal; below 0 they count as 0
+    worth   [N] >= 0
     """
     away = (means - means.median(dim=0).values).abs().amax(dim=1)
     order = torch.sort(away, stable=True).indices
-    worth = costs.double().clamp_min(0)[order].cumsum(0)
-    reach = int(torch.searchsorted(worth, (1 - FAR_SHARE) * worth[-1:]))
+    summed = worth.double()[order].cumsum(0)
+    reach = int(torch.searchsorted(summed, (1 - FAR_SHARE) * summed[-1:]))
     return away <= 2 * away[order[min(reach, len(order) - 1)]]
 
 
@@ -72,8 +72,8 @@ def converted(
     """
     model.active_sh_degree = model.max_sh_degree
     found = worth(model, views, rasterizer, background, lambda_dssim=config.loss.lambda_dssim)
-    rows = kept_rows(found.squared_error, views, config)
-    rows = rows[within_reach(model.means.detach()[rows], found.squared_error[rows])]
+    rows = kept_rows(found, views, config)
+    rows = rows[within_reach(model.means.detach()[rows], found.change[rows])]
     network = AppearanceNetwork(
         LATENTS.width, config.appearance.hidden, max(model.max_sh_degree, 1), generator=generator
     ).to(background.device)

@@ -35,7 +35,7 @@ class Wisp(Method):
 
     1. START    from a trained 3DGS scene that has more splats than stay
     2. TRAIN    with noise in place of rounding and the bits of the file in the loss; a splat whose bits cost more than
-                the exact price of its removal goes
+                what the pictures lose by its removal goes
     3. ENCODE   residuals against what the decoder knows, by integer arithmetic
     4. DECODE   to a plain GaussianModel: no network runs when it is drawn
     """

@@ -6,7 +6,7 @@ from splatwizard_core.api import Registry, hookimpl
 @hookimpl
 def register_methods(registry: Registry) -> None:
     registry.add("wisp", "sw_wisp.method:Wisp", title="Wisp",
-                 summary="explicit splats coded as residuals against those before them, removed by their exact cost",
+                 summary="explicit splats coded as residuals against those before them, removed by what pictures lose",
                  prefixes="", presets=["paper", "fast", "quick"], rates=["r1", "r2", "r3", "r4", "r5"],
                  native=["sw_codecs.exact_native:EXACT", "sw_wisp.fast.exact_native:EXACT",
                          "sw_wisp.fast.native:WISP"])  # fmt: skip

@@ -18,19 +18,23 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Worth:
-    """Exact costs of the removal of each splat alone, over some views.
+    """What the pictures of some views lose by the removal of each splat alone.
 
-    squared_error   [N] float64: how much the squared error rises; below 0: the pictures get better
+    change          [N] float64: squared change of the pictures; 0: hidden, or unseen
+    cost            [N] float64: how much the squared error rises at once; below 0: the pictures get better
     loss_of_error   rise of their mean photometric loss for a rise of the squared error by 1
+
+    The others learn on: what is left of the slope of the error is theirs to take. So a splat is worth its change.
     """
 
-    squared_error: Tensor
+    change: Tensor
+    cost: Tensor
     loss_of_error: float
 
     @property
     def loss_rise(self) -> Tensor:
         """[N] float64: how much the loss rises by each removal."""
-        return self.squared_error * self.loss_of_error
+        return self.change * self.loss_of_error
 
 
 @torch.no_grad()
@@ -39,8 +43,9 @@ def worth(
 ) -> Worth:
     """Return what each splat is worth to all `views`."""
     device = background.device
-    costs = removal_costs(lambda camera: model.gaussians(camera.to(device), rasterizer), views, rasterizer, background)
-    return Worth(costs.cost, loss_of_error(model, views, rasterizer, background, lambda_dssim=lambda_dssim))
+    found = removal_costs(lambda camera: model.gaussians(camera.to(device), rasterizer), views, rasterizer, background)
+    scale = loss_of_error(model, views, rasterizer, background, lambda_dssim=lambda_dssim)
+    return Worth(found.change, found.cost, scale)
 
 
 @torch.no_grad()
