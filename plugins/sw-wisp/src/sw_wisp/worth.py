@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Worth:
-    """What the pictures of some views lose by the removal of each splat alone.
+    """Losses of the pictures of some views by the removal of each splat alone.
 
     change          [N] float64: squared change of the pictures; 0: hidden, or unseen
     cost            [N] float64: how much the squared error rises at once; below 0: the pictures get better
