@@ -120,14 +120,25 @@ def followed(state: TrainingState, make_stage: MakeStage, count: int) -> Iterato
             for process in others:
                 process.start()
             wait_for(others, ready)
-            with joined(Ranks(0, count), state.device, meeting) as ranks, _watched(others):
-                yield ranks
+            with joined(Ranks(0, count), state.device, meeting) as ranks:
+                try:
+                    with _watched(others):
+                        yield ranks
+                finally:
+                    if not state.finished:
+                        end(others)  # before the exchange ends, which they would take for a failure
         finally:
             for process in others:
-                if state.finished:
-                    process.join(FAREWELL_S)
-                process.terminate()
-                process.join()
+                process.join(FAREWELL_S if state.finished else 0)
+            end(others)
+
+
+def end(others: Sequence[SpawnProcess]) -> None:
+    """End these processes, if they have not yet."""
+    for process in others:
+        process.terminate()
+    for process in others:
+        process.join()
 
 
 def follow(ranks: Ranks, job: Path, meeting: Path, ready: Semaphore) -> None:

@@ -73,14 +73,15 @@ def joined(ranks: Ranks, device: torch.device, meeting: Path) -> Iterator[Ranks]
         yield ranks
     except BaseException:
         give_up()  # else the end would wait for sums that the others never make
+        with contextlib.suppress(Exception):  # of what was given up; the first error is the one to tell
+            dist.destroy_process_group()
         raise
-    finally:
+    else:
         dist.destroy_process_group()
 
 
 def give_up() -> None:
     """End all exchange of this process at once; what waits for it raises."""
-    group = dist.group.WORLD
-    with contextlib.suppress(Exception):  # there is none, or it is of Gloo, which notices by itself
-        assert group is not None
-        group.abort()
+    with contextlib.suppress(Exception):  # Gloo has no `abort`: it notices by itself that a process is gone
+        assert dist.group.WORLD is not None
+        dist.group.WORLD.abort()
