@@ -30,7 +30,6 @@ import torch
 from splatwizard_core.api import SH, Camera, GaussianInputs, RasterOptions
 from sw_rasterizers.call import BACKWARD_STAGES, FORWARD_STAGES
 from sw_rasterizers.inference import FlashRasterizer, TensorCoreRasterizer
-from sw_rasterizers.ops import backward_seconds
 from sw_rasterizers.standard import StandardRasterizer
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -159,7 +158,7 @@ def stages(g: GaussianInputs, cameras: list[Camera]) -> tuple[dict[str, float], 
             result.image.sum().backward()
             s = result.stats
             if turn:
-                rows.append({k: 1e3 * v for k, v in {**s.stage_seconds, **backward_seconds()}.items()})
+                rows.append({k: 1e3 * v for k, v in s.stage_seconds.items()})
                 named = {"V": s.n_visible, "P": s.n_pairs, "E": s.n_evaluated, "B": s.n_blended, "X": s.n_pixels}
                 counts.append({k: float(v or 0) for k, v in named.items()})
     for x in leaves(g):

@@ -63,5 +63,22 @@ def test_other_types_and_places_are_torchs(device):
 def test_a_second_derivative_is_refused_on_cuda():
     assert TRAINING.has_cuda()
     log_scales, logits = leaves("cuda")
-    with pytest.raises(RuntimeError, match="create_graph"):
-        torch.autograd.grad(activated(log_scales, logits)[0].sum(), log_scales, create_graph=True)
+    (slope,) = torch.autograd.grad(activated(log_scales, logits)[0].sum(), log_scales, create_graph=True)
+    with pytest.raises(RuntimeError, match="twice"):
+        torch.autograd.grad(slope.sum(), log_scales)
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="no two GPUs")
+@pytest.mark.parametrize("current", [0, 1])
+def test_the_work_is_done_where_the_tensors_are_and_the_current_gpu_stays(current):
+    with torch.cuda.device(current):
+        for own in (0, 1, 0):
+            log_scales, logits = leaves(f"cuda:{own}")
+            scales, opacities = activated(log_scales, logits)
+            (scales.sum() + opacities.sum()).backward()
+            torch.testing.assert_close(log_scales.grad, log_scales.detach().exp(), rtol=3e-7, atol=0)
+            assert torch.cuda.current_device() == current
+            assert torch.zeros(1, device="cuda").get_device() == current
+        with pytest.raises(RuntimeError, match=r"on the GPU, got .* on cuda:1"):
+            activated(leaves("cuda:0")[0], leaves("cuda:1")[1])

@@ -7,6 +7,7 @@ import torch
 from sw_gaussians.density import fragments
 from sw_gaussians.density.mcmc import draw
 from sw_gaussians.fast.fused_adam import FusingOptimizer
+from sw_gaussians.fast.statistics import accumulate_fragments
 from sw_gaussians.native import GAUSSIANS
 from sw_gaussians.stage import ThreeDGSStage
 from sw_gaussians.start import gaussians_from_points
@@ -203,9 +204,7 @@ def test_sums_over_fragments_of_one_launch_are_those_of_many():
         gradients, logits = (torch.randn(500, generator=generator).cuda() for _ in range(2))
         logits[:4] = torch.tensor([-40.0, 17.0, 90.0, float("nan")])
         found = torch.rand(500, 2, generator=generator).cuda()
-        assert torch.ops.splatwizard_gaussians.fragment_statistics(
-            gradients, logits, found, ours, fragments.MIN_TRANSPARENCY
-        )
+        assert accumulate_fragments(ours, gradients, logits, found, least_clear=fragments.MIN_TRANSPARENCY)
         fragments.accumulate_fragments_in_torch(theirs, gradients, logits, found)
     torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-6, equal_nan=True)
     assert ours[3, 0].isnan()

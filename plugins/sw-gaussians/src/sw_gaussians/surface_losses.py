@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from splatwizard_core.api import Camera, LossPack, RenderResult
+from sw_gaussians import cuda_face
 from sw_gaussians.native import GAUSSIANS
 from sw_gaussians.surface import camera_normals, depth_modes, surface_depth
 
@@ -67,7 +68,7 @@ def normal_disagreement(result: RenderResult, camera: Camera, depth_ratio: float
 
 def _disagreement(depth: Tensor, normals: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
     if depth.is_cuda and depth.dtype == torch.float32 and GAUSSIANS.has_cuda():
-        lens = (camera.fx, camera.fy, camera.cx, camera.cy)
+        lens = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
         found: Tensor = _Disagreement.apply(depth, normals, alpha, lens)  # type: ignore[no-untyped-call]
         return found
     return disagreement_in_torch(depth, normals, alpha, camera)
@@ -113,15 +114,21 @@ def add_surface_losses(
 
 class _Disagreement(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, depth: Tensor, normals: Tensor, alpha: Tensor, lens: tuple[float, ...]) -> Tensor:
-        tensors = depth.contiguous(), normals.contiguous(), alpha.contiguous()
-        ctx.save_for_backward(*tensors)
+    def forward(ctx: Any, depth: Tensor, normals: Tensor, alpha: Tensor, lens: dict[str, float]) -> Tensor:
+        depth, normals, alpha = depth.contiguous(), normals.contiguous(), alpha.contiguous()
+        found = torch.empty_like(depth)
+        cuda_face.disagreement(depth=depth, normals=normals, alpha=alpha, found=found, **lens)
+        ctx.save_for_backward(depth, normals, alpha)
         ctx.lens = lens
-        found: Tensor = torch.ops.splatwizard_gaussians.disagreement(*tensors, lens)
         return found
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        found = torch.ops.splatwizard_gaussians.disagreement_backward(grad.contiguous(), *ctx.saved_tensors, ctx.lens)
-        return *found, None, None
+        depth, normals, alpha = ctx.saved_tensors
+        to_depth, to_normals = torch.empty_like(depth), torch.empty_like(normals)
+        cuda_face.disagreement_backward(
+            grad=grad.contiguous(), depth=depth, normals=normals, alpha=alpha, to_depth=to_depth,
+            to_normals=to_normals, **ctx.lens,
+        )  # fmt: skip
+        return to_depth, to_normals, None, None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass, field
-from typing import Any
 
 from torch import Tensor
 
@@ -13,7 +12,7 @@ from splatwizard_core.api import Camera, GradBuffer
 INPUTS = (
     "means", "opacities", "scales", "quats", "cov3d", "sh", "sh_dc", "sh_rest", "colors", "features", "scale_factors",
 )  # fmt: skip
-"""Differentiable inputs in the order in which the ops on CUDA take them."""
+"""Differentiable inputs."""
 
 FORWARD_STAGES = ("project", "sort", "bin", "blend")
 BACKWARD_STAGES = ("blend_backward", "project_backward")
@@ -41,7 +40,7 @@ class Flag(enum.IntFlag):
     FOR_SCORES = 65536  # with SAVE: nothing that only the backward pass needs
     ORDERED = 131072
     FRAGMENTS = 262144  # with ABSGRAD: other sums in its two columns
-    SURFELS = 1 << 19  # on the CPU
+    SURFELS = 1 << 19
     WITH_MAPS = 1 << 20  # of surfels: depth, normals and distortion
 
 
@@ -51,7 +50,7 @@ class Call:
 
     camera          18 numbers: R, tau, fx, fy, cx, cy, near, far
     geom_indices    [N] int64, rows of scales and quats, none outside: the kernels do not look
-    seconds         stage -> seconds, filled by the forward pass, on the CPU also by the backward pass
+    seconds         stage -> seconds, filled by both passes; on CUDA only if the call counts
     counts          visible Gaussians, (splat, tile) pairs, evaluated and blended pixel-splat pairs (-1 unless counted),
                     inputs that are not finite
     """
@@ -70,10 +69,6 @@ class Call:
     absgrad2d: GradBuffer | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     counts: list[int] = field(default_factory=list)
-
-    def settings(self) -> tuple[Any, ...]:
-        """Return the arguments of the ops on CUDA."""
-        return self.camera, self.width, self.height, self.sh_degree, self.scale_modifier, self.eps2d, int(self.flags)
 
 
 def camera_numbers(cam: Camera) -> list[float]:

@@ -72,8 +72,8 @@ class Picture:
         colors, features, background = tensors["colors"], tensors.get("features"), call.background
         self.call, self.flags = call, flags
         self.colors = 3 if colors is None else colors.shape[1]
-        depths = bool(flags & INVERSE_DEPTH) + bool(flags & ACCUMULATED_DEPTH)
-        self.channels = self.colors + depths + (0 if features is None else features.shape[1])
+        self.depths = bool(flags & INVERSE_DEPTH) + bool(flags & ACCUMULATED_DEPTH)
+        self.channels = self.colors + self.depths + (0 if features is None else features.shape[1])
         self.size = call.height, call.width
         self.view: Arguments = {"camera": call.camera, "width": call.width, "height": call.height, "flags": flags}
         self.how: Arguments = {
@@ -121,7 +121,7 @@ def project(picture: Picture, tensors: Tensors, *, training: bool = False) -> Pr
     count, colors = len(means), picture.colors
     bytes_of = _splat_bytes(means.element_size(), count, picture.flags, picture.channels, colors, call.sh_degree)
     splats, radii = empty((bytes_of,), torch.uint8), torch.empty(count, dtype=torch.int32)
-    most = _most_pairs() // (2 if training else 1)
+    most = most_pairs() // (2 if training else 1)
     room = min(most, max(4 * count + (1 << 14), _Listed.recent + _Listed.recent // 4))
     while True:
         tiles = empty((room,), torch.int32)
@@ -195,7 +195,7 @@ def _splat_bytes(real_bytes: int, count: int, flags: int, channels: int, colors:
     return found.splat_bytes
 
 
-def _most_pairs() -> int:
+def most_pairs() -> int:
     """Pairs that a call may have; a file of a kilobyte can ask for any number of them."""
     asked = os.environ.get(LIMIT, "")
     return min(int(asked) if asked.isdigit() and int(asked) else MOST_PAIRS, (1 << 31) - 1)

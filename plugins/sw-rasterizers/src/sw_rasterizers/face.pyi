@@ -262,6 +262,8 @@ def shade_shared_backward(
     offsets: Tensor | Array[Any] | int,
     by_colors: Tensor | Array[Any] | int,
     passed: Tensor | Array[Any] | int,
+    carried: Tensor | Array[Any] | int | None = None,
+    runs: int | None = None,
     of_codebook: Tensor | Array[Any] | int,
     of_means: Tensor | Array[Any] | int,
     of_dc: Tensor | Array[Any] | int | None = None,

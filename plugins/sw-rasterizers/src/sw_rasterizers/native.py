@@ -2,9 +2,45 @@
 
 from __future__ import annotations
 
-from typing import Any
+from splatwizard_native import NativeModule
 
-from splatwizard_native import NativeBuildError, NativeModule
+CFLAGS = ("-fno-math-errno", "-fno-trapping-math")
+"""Neither changes a result: no caller reads errno, no one traps floating-point exceptions. Without them square roots
+and selections stay scalar. Nothing of -ffast-math is needed, the packs are vectors as written."""
+
+MODULE_CUDA = NativeModule(
+    name="sw_rasterizers_cuda",
+    package="sw_rasterizers",
+    sources=(
+        "csrc/cuda/face_render.cpp",
+        "csrc/cuda/face_backward.cpp",
+        "csrc/cuda/face_scores.cpp",
+        "csrc/cuda/face_shared.cpp",
+    ),
+    headers=("csrc/*.h", "csrc/cuda/*.h", "csrc/cpu/face.h", "csrc/cpu/simd.h"),
+    cuda_sources=(
+        "csrc/cuda/sort.cu",
+        "csrc/cuda/blend_backward.cu",
+        "csrc/cuda/blend.cu",
+        "csrc/cuda/blend_few.cu",
+        "csrc/cuda/flash.cu",
+        "csrc/cuda/tcgs.cu",
+        "csrc/cuda/fisher.cu",
+        "csrc/cuda/project_backward.cu",
+        "csrc/cuda/surfel_blend_backward.cu",
+        "csrc/cuda/surfel_project_backward.cu",
+        "csrc/cuda/surfel_blend.cu",
+        "csrc/cuda/surfel_project.cu",
+        "csrc/cuda/scores.cu",
+        "csrc/cuda/project.cu",
+        "csrc/cuda/emit.cu",
+        "csrc/cuda/shade.cu",
+        "csrc/cuda/shared_colors.cu",
+    ),
+    cflags=CFLAGS,
+    without="rendering on a GPU falls back to the pure-torch reference, some hundred times slower",
+    face="csrc/cuda/face.h",
+)
 
 MODULE = NativeModule(
     name="sw_rasterizers",
@@ -25,54 +61,11 @@ MODULE = NativeModule(
         "csrc/cpu/shared_colors.cpp",
     ),
     headers=("csrc/*.h", "csrc/cpu/*.h"),
-    # Neither changes a result: no caller reads errno, no one traps floating-point exceptions. Without them square
-    # roots and selections stay scalar. Nothing of -ffast-math is needed, the packs are vectors as written.
-    cflags=("-fno-math-errno", "-fno-trapping-math"),
+    cflags=CFLAGS,
     without="rendering falls back to the pure-torch reference, some hundred times slower",
     face="csrc/cpu/face.h",
-    cuda=NativeModule(
-        name="sw_rasterizers_cuda",
-        package="sw_rasterizers",
-        sources=(
-            "csrc/cuda/binding_cuda.cpp",
-            "csrc/cuda/binding_draw_cuda.cpp",
-            "csrc/cuda/binding_scores_cuda.cpp",
-            "csrc/cuda/binding_surfel_cuda.cpp",
-            "csrc/cuda/binding_shared_cuda.cpp",
-        ),
-        headers=("csrc/*.h", "csrc/cuda/*.h", "csrc/cpu/simd.h"),
-        cuda_sources=(
-            "csrc/cuda/sort.cu",
-            "csrc/cuda/blend_backward.cu",
-            "csrc/cuda/blend.cu",
-            "csrc/cuda/blend_few.cu",
-            "csrc/cuda/flash.cu",
-            "csrc/cuda/tcgs.cu",
-            "csrc/cuda/fisher.cu",
-            "csrc/cuda/project_backward.cu",
-            "csrc/cuda/surfel_blend_backward.cu",
-            "csrc/cuda/surfel_project_backward.cu",
-            "csrc/cuda/surfel_blend.cu",
-            "csrc/cuda/surfel_project.cu",
-            "csrc/cuda/scores.cu",
-            "csrc/cuda/project.cu",
-            "csrc/cuda/emit.cu",
-            "csrc/cuda/shade.cu",
-            "csrc/cuda/shared_colors.cu",
-        ),
-        cflags=("-fno-math-errno", "-fno-trapping-math"),
-        without="rendering on a GPU falls back to the pure-torch reference, some hundred times slower",
-    ),
+    cuda=MODULE_CUDA,
 )
-
-
-def cuda_ops() -> Any:
-    """Return the ops on CUDA. Raises NativeBuildError."""
-    import torch  # here: what a package offers is told without it
-
-    if not MODULE.has_cuda():
-        raise NativeBuildError(str(unavailable_on_cuda()))
-    return torch.ops.sw_rasterizers
 
 
 def unavailable() -> str | None:

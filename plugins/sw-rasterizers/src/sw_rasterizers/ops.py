@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import math
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from splatwizard_core.api import Camera
-from splatwizard_native import offered_update
-from sw_rasterizers import cpu
-from sw_rasterizers.call import BACKWARD_STAGES, FORWARD_STAGES, INPUTS, Call, Flag, camera_numbers
-from sw_rasterizers.native import MODULE, cuda_ops
+from splatwizard_native import AdamUpdate, offered_update
+from sw_rasterizers import cpu, cuda
+from sw_rasterizers.call import INPUTS, Call, Flag, camera_numbers
 
 UPDATED = ("sh_dc", "sh_rest")
 """Inputs for which the backward pass on CUDA can do Adam's step (`splatwizard_native.offer_update`)."""
@@ -57,57 +56,85 @@ class _Rasterize(torch.autograd.Function):
         return None, None, *map(found.get, INPUTS)
 
 
-def _updates(tensors: dict[str, Tensor | None]) -> tuple[list[Tensor], list[float]]:
-    """Return tensors and rates of the Adam updates of sh_dc and sh_rest to fuse into backward on CUDA, if any."""
-    offers = [None if (param := tensors.get(name)) is None else offered_update(param) for name in UPDATED]
-    if all(u is None for u in offers):
-        return [], []
-    updated: list[Tensor] = []
-    rates: list[float] = []
-    for name, u in zip(UPDATED, offers, strict=True):
-        param = tensors.get(name)
-        if param is None or u is None:
-            updated += [torch.empty(0)] * 3
-            rates += [0.0] * 6
-            continue
-        updated += [param, u.exp_avg, u.exp_avg_sq]
-        rates += [
-            u.lr / (1 - u.beta1**u.step),
-            1 - u.beta1,
-            u.beta2,
-            1 - u.beta2,
-            1 / math.sqrt(1 - u.beta2**u.step),
-            u.eps,
-        ]
-    return updated, rates
+@dataclass
+class _Drawing:
+    """A drawing on CUDA on its way from one node of autograd to the other.
+
+    updates     of sh_dc and sh_rest, which the backward pass does where it finds their gradients
+    """
+
+    picture: cpu.Picture
+    updates: dict[str, AdamUpdate]
+    drawn: cuda.Drawn | None = None
 
 
-def _draw_on_cuda(call: Call, tensors: dict[str, Tensor | None]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Render with gradients on CUDA; the autograd nodes are in C++ (csrc/cuda/binding_draw_cuda.cpp)."""
-    image, radii, alpha, median, call.counts, seconds, late = cuda_ops().draw(
-        *map(tensors.get, INPUTS), call.geom_indices, call.visible, call.background, *call.settings(),
-        call.grad2d is not None, call.absgrad2d is not None, *_updates(tensors),
-    )  # fmt: skip
-    call.seconds.update(zip(FORWARD_STAGES, seconds, strict=False))
-    for buffer in (call.grad2d, call.absgrad2d):
-        if buffer is not None:
-            buffer.set(late.pop(0))
-    return image, radii, alpha, median
+class _Project(torch.autograd.Function):
+    """First node on CUDA: a stand-in [N, sums of a Gaussian] without memory, whose gradient is what `_Blend` sums up.
+
+    Two nodes, so that the lists are free again before there is room for the gradients of the inputs. All large state
+    goes through save_for_backward, so that it is freed with the graph even if the result lives on.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, drawing: _Drawing, dummy: Tensor | None, *inputs: Tensor | None) -> Tensor:
+        tensors = [None if x is None else x.detach().contiguous() for x in inputs]
+        drawing.drawn = drawn = cuda.draw(drawing.picture, dict(zip(INPUTS, tensors, strict=True)))
+        assert drawn.kept is not None
+        ctx.drawing = drawing
+        ctx.save_for_backward(*tensors, drawn.kept.drawn)
+        radii = drawn.radii
+        length = cuda.row_length(drawing.picture, radii.get_device())
+        return radii.new_empty_strided((len(radii), length), (0, 0), dtype=torch.float32)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, rows: Tensor) -> tuple[Tensor | None, ...]:
+        *stored, drawn = ctx.saved_tensors
+        drawing: _Drawing = ctx.drawing
+        call = drawing.picture.call
+        statistics = {"grad2d": call.grad2d, "absgrad2d": call.absgrad2d}
+        wanted = {name for name, asked in zip(INPUTS, ctx.needs_input_grad[2:], strict=True) if asked}
+        wanted |= {name for name, buffer in statistics.items() if buffer is not None}
+        tensors = dict(zip(INPUTS, stored, strict=True))
+        found = cuda.project_backward(drawing.picture, tensors, drawn, rows.contiguous(), wanted, drawing.updates)
+        drawing.updates = {}
+        for name, buffer in statistics.items():
+            if buffer is not None:
+                buffer.set(found[name])
+        return None, None, *map(found.get, INPUTS)
 
 
-def _draw_plainly_on_cuda(call: Call, tensors: dict[str, Tensor | None]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    image, radii, alpha, median, _, call.counts, seconds = cuda_ops().render(
-        *map(tensors.get, INPUTS), call.geom_indices, call.visible, call.background, *call.settings()
-    )
-    call.seconds.update(zip(FORWARD_STAGES, seconds, strict=False))  # only if counting
-    return image, radii, alpha, median
+class _Blend(torch.autograd.Function):
+    """Second node on CUDA: image [C,H,W], radii [N] int32, alpha and median depth [1,H,W] or None."""
+
+    @staticmethod
+    def forward(ctx: Any, drawing: _Drawing, stand_in: Tensor) -> tuple[Tensor | None, ...]:
+        drawn = drawing.drawn
+        assert drawn is not None
+        assert drawn.kept is not None
+        ctx.drawing, drawing.drawn = drawing, None
+        ctx.count, ctx.sizes = len(stand_in), drawn.kept.sizes
+        ctx.set_materialize_grads(False)
+        ctx.mark_non_differentiable(drawn.radii)
+        ctx.save_for_backward(drawn.kept.lists, drawn.kept.pair_splats)
+        return drawn.image, drawn.radii, drawn.alpha, drawn.median
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+        image, _, alpha, median = (None if x is None else x.contiguous() for x in grads)
+        lists, pair_splats = ctx.saved_tensors
+        picture: cpu.Picture = ctx.drawing.picture
+        if image is None:
+            image = lists.new_zeros((picture.channels, *picture.size), dtype=torch.float32)
+        kept = cuda.Kept(lists, pair_splats, lists, ctx.sizes)
+        return None, cuda.blend_backward(picture, ctx.count, kept, {"image": image, "alpha": alpha, "median": median})
 
 
-def backward_seconds() -> dict[str, float]:
-    """Seconds of each stage of the last backward pass of a counting rasterizer on CUDA; none without CUDA."""
-    if not MODULE.has_cuda():
-        return {}
-    return dict(zip(BACKWARD_STAGES, torch.ops.sw_rasterizers.backward_seconds(), strict=False))
+def _updates(tensors: dict[str, Tensor | None]) -> dict[str, AdamUpdate]:
+    """Return the Adam updates of sh_dc and sh_rest to fuse into the backward pass on CUDA."""
+    offers = {name: offered_update(x) for name in UPDATED if (x := tensors.get(name)) is not None}
+    return {name: u for name, u in offers.items() if u is not None}
 
 
 def rasterize(call: Call, tensors: dict[str, Tensor | None]) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
@@ -124,15 +151,16 @@ def rasterize(call: Call, tensors: dict[str, Tensor | None]) -> tuple[Tensor, Te
     differentiable = recording and any(x is not None and x.requires_grad for x in inputs)
     if not differentiable and not (recording and (call.grad2d is not None or call.absgrad2d is not None)):
         plain = {name: None if x is None else x.detach().contiguous() for name, x in zip(INPUTS, inputs, strict=True)}
-        if means.is_cuda:
-            return _draw_plainly_on_cuda(call, plain)
-        drawn = cpu.draw(cpu.Picture(call, plain, int(call.flags)), plain)
+        picture = cpu.Picture(call, plain, int(call.flags))
+        drawn = cuda.draw(picture, plain) if means.is_cuda else cpu.draw(picture, plain)
         return drawn.image, drawn.radii, drawn.alpha, drawn.median
-    if means.is_cuda:
-        return _draw_on_cuda(call, tensors)
     call.flags |= Flag.SAVE
     # Statistics are wanted even if no input needs a gradient.
     dummy = None if differentiable else torch.empty(0, requires_grad=True)
+    if means.is_cuda:
+        named = dict(zip(INPUTS, inputs, strict=True))
+        drawing = _Drawing(cpu.Picture(call, named, int(call.flags)), _updates(named))
+        return _Blend.apply(drawing, _Project.apply(drawing, dummy, *inputs))  # type: ignore[no-any-return]
     return _Rasterize.apply(call, dummy, *inputs)  # type: ignore[no-any-return]
 
 
@@ -150,10 +178,8 @@ def visible_radii(
     """Return radii [N] int32, px, from geometry alone; 0 = culled. No gradient."""
     tensors = means, scales, quats, cov3d, scale_factors, geom_indices, visible
     geometry = [None if x is None else x.detach().contiguous() for x in tensors]
-    if means.is_cuda:
-        found: Tensor = cuda_ops().visible_radii(*geometry, camera_numbers(cam), cam.width, cam.height, 1.0, 0.3)
-        return found
     *given, rows, mask = geometry
     call = Call(camera_numbers(cam), cam.width, cam.height, 0, 1.0, 0.3, Flag(0), geom_indices=rows, visible=mask)
     names = "means", "scales", "quats", "cov3d", "scale_factors"
-    return cpu.visible_radii(call, dict(zip(names, given, strict=True)))
+    on_device = cuda if means.is_cuda else cpu
+    return on_device.visible_radii(call, dict(zip(names, given, strict=True)))

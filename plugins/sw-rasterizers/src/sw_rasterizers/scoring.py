@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.api import AccumOutput, CapabilityError, GaussianInputs, RasterOptions, ScoreSpec
-from sw_rasterizers import cpu, face
+from sw_rasterizers import cpu, cuda, cuda_face, face
 from sw_rasterizers.call import Call, Flag
+from sw_rasterizers.cpu import SAVE
 from sw_rasterizers.memory import empty
-from sw_rasterizers.native import cuda_ops
 
 KINDS = (
     "hits", "opacity", "opacity_T", "blend", "blend_max", "gamma", "dist", "blend_sq", "shown", "grad_sq", "removal",
@@ -70,12 +70,38 @@ def add_scores(g: GaussianInputs, call: Call, opt: RasterOptions, totals: Totals
     if not g.means.is_cuda:
         _add_on_cpu(tensors, call, opt.scores, totals)
         return
-    weights, rows = _pixel_weights(opt.scores, g.means)
-    cuda_ops().accumulate_scores(
-        *tensors.values(), call.visible, call.background, *call.settings(),
-        [KINDS.index(s.kind) for s in opt.scores], [int(s.rule == "tested") for s in opt.scores],
-        [float(s.gamma) for s in opt.scores], rows, weights, totals.scores, totals.fisher,
-    )  # fmt: skip
+    _add_on_cuda(tensors, call, opt.scores, totals)
+
+
+def _add_on_cuda(tensors: cpu.Tensors, call: Call, specs: tuple[ScoreSpec, ...], totals: Totals) -> None:
+    flags = (int(call.flags) | SAVE | cuda.FOR_SCORES) & ~cuda.COUNT
+    named: cpu.Tensors = {"features": None, "scale_factors": None, **tensors}
+    means = named["means"]
+    if len(means) == 0:
+        return
+    picture = cpu.Picture(call, named, flags)
+    kept = cuda.draw(picture, named).kept
+    assert kept is not None
+    scratch, sizes = None, None
+    if flags & cuda.ORDERED:
+        sizes = cuda.plan_sums(picture, len(means), kept, means.get_device())
+        most = max(sizes.score_bytes if specs else 0, sizes.fisher_bytes if totals.fisher is not None else 0)
+        scratch = means.new_empty(most, dtype=torch.uint8)
+    view = {
+        "lists": kept.lists, "pair_splats": kept.pair_splats, **kept.sizes, "count": len(means), "scratch": scratch,
+        **picture.view, **picture.canvas,
+    }  # fmt: skip
+    if specs:
+        cuda_face.accumulate_scores(
+            **view, real_bytes=4, scores=len(specs), kinds=[KINDS.index(spec.kind) for spec in specs],
+            tested=[spec.rule == "tested" for spec in specs], gammas=[float(spec.gamma) for spec in specs],
+            weights=_weights(specs, means), totals=list(totals.scores),
+        )  # fmt: skip
+    if totals.fisher is not None:
+        cuda_face.accumulate_fisher(
+            **view, **named, **picture.how, geom_indices=None, visible=call.visible, drawn=kept.drawn,
+            rows=means.new_zeros(kept.sizes["used"], FISHER_SUMS), blocks=totals.fisher,
+        )  # fmt: skip
 
 
 def _add_on_cpu(tensors: cpu.Tensors, call: Call, specs: tuple[ScoreSpec, ...], totals: Totals) -> None:
@@ -94,7 +120,7 @@ def _add_on_cpu(tensors: cpu.Tensors, call: Call, specs: tuple[ScoreSpec, ...], 
     image = picture.empty_image(means.dtype) if sensitive or totals.fisher is not None else None
     _, lists = cpu.make_lists(picture, projected, image)
     view = {"splats": projected.splats, "lists": lists, "pairs": pairs, **picture.view, **picture.canvas}
-    weights = [given.detach().to(means).contiguous() if (given := _weight(s)) is not None else None for s in specs]
+    weights = _weights(specs, means)
     for family in ([i for i in range(len(specs)) if i not in sensitive], sensitive):
         if family:
             face.add_scores(
@@ -111,18 +137,7 @@ def _add_on_cpu(tensors: cpu.Tensors, call: Call, specs: tuple[ScoreSpec, ...], 
         )  # fmt: skip
 
 
-def _weight(spec: ScoreSpec) -> Tensor | None:
-    """Return the weights [H,W] of pixels, or the residual [3,H,W]."""
-    return spec.pixel_weight if spec.residual is None else spec.residual
-
-
-def _pixel_weights(specs: tuple[ScoreSpec, ...], like: Tensor) -> tuple[Tensor | None, list[int]]:
-    """Return pixel-weight maps [M,H,W], and the map index per score (first of a residual's three); -1: none."""
-    maps: list[Tensor] = []
-    rows = []
-    for spec in specs:
-        given = _weight(spec)
-        rows.append(-1 if given is None else len(maps))
-        if given is not None:
-            maps.extend(given.detach().to(like).reshape(-1, *given.shape[-2:]))
-    return (torch.stack(maps).contiguous() if maps else None), rows
+def _weights(specs: tuple[ScoreSpec, ...], like: Tensor) -> list[Tensor | None]:
+    """Return the weights [H,W] of pixels, or the residual [3,H,W], or None, for each score."""
+    found = [spec.pixel_weight if spec.residual is None else spec.residual for spec in specs]
+    return [None if x is None else x.detach().to(like).contiguous() for x in found]

@@ -14,9 +14,8 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.api import SH
-from sw_rasterizers import face
+from sw_rasterizers import cuda, cuda_face, face
 from sw_rasterizers.memory import empty
-from sw_rasterizers.native import cuda_ops
 from sw_rasterizers.segments import Segments
 
 
@@ -50,10 +49,10 @@ class _SharedColors(torch.autograd.Function):
         ctx.arguments = segments.indices, center.contiguous(), degree, clamp
         ctx.segments = segments
         if means.is_cuda:
-            found: Tensor = cuda_ops().shared_colors(*tensors, *ctx.arguments)
-            return found
-        colors = empty(tuple(means.shape), means.dtype)
-        face.shade_shared(**_shared(ctx, tensors), colors=colors)
+            cuda.check()
+        colors = _room(means)
+        operations = cuda_face if means.is_cuda else face
+        operations.shade_shared(**_shared(ctx, tensors), colors=colors)
         return colors
 
     @staticmethod
@@ -61,18 +60,19 @@ class _SharedColors(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         tensors, segments, gradient = ctx.saved_tensors, ctx.segments, gradient.contiguous()
         means, dc, codebook = tensors
-        if means.is_cuda:
-            of_codebook, of_dc, of_means = cuda_ops().shared_colors_backward(
-                *tensors, *ctx.arguments, segments.order, segments.offsets, gradient
-            )
-            return of_codebook, of_dc if dc is not None else None, of_means, None, None, None, None
-        of_means, of_codebook = (empty(tuple(x.shape), x.dtype) for x in (means, codebook))
-        of_dc = None if dc is None else empty(tuple(dc.shape), dc.dtype)
-        face.shade_shared_backward(
+        of_means, of_codebook, of_dc = _room(means), _room(codebook), None if dc is None else _room(dc)
+        # A run of 128 Gaussians carries what belongs to the entry that it ends with.
+        carried = means.new_empty(-(-len(means) // 128), 48) if means.is_cuda else None
+        operations = cuda_face if means.is_cuda else face
+        operations.shade_shared_backward(
             **_shared(ctx, tensors), order=segments.order, offsets=segments.offsets, by_colors=gradient,
-            passed=empty(tuple(means.shape), means.dtype), of_codebook=of_codebook, of_means=of_means, of_dc=of_dc,
+            passed=_room(means), carried=carried, of_codebook=of_codebook, of_means=of_means, of_dc=of_dc,
         )  # fmt: skip
         return of_codebook, of_dc, of_means, None, None, None, None
+
+
+def _room(like: Tensor) -> Tensor:
+    return torch.empty_like(like) if like.is_cuda else empty(tuple(like.shape), like.dtype)
 
 
 def _shared(ctx: Any, tensors: Sequence[Tensor | None]) -> dict[str, Any]:

@@ -39,8 +39,8 @@ class StandardRasterizer:
     original's gradients through the clamps of alpha and of the Jacobian.
     Scores of Gaussians are formed in a pass of their own, and only where they are asked for.
 
-    count   also count evaluated and blended pixel-splat pairs into the statistics, and on CUDA measure the stages
-            (those of the backward pass are in `ops.backward_seconds()`); slow, for benchmarks
+    count   also count evaluated and blended pixel-splat pairs into the statistics, and on CUDA measure the stages;
+            slow, for benchmarks
     """
 
     info: RasterizerInfo = RasterizerInfo.declared(plugin.register_rasterizers, "standard")

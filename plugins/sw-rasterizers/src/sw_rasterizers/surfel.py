@@ -19,13 +19,12 @@ from splatwizard_core.api import (
     RasterStats,
     RenderResult,
 )
-from sw_rasterizers import cpu, plugin
-from sw_rasterizers.call import BACKWARD_STAGES, FORWARD_STAGES, Call, Flag, camera_numbers
+from sw_rasterizers import cpu, cuda, plugin
 from sw_rasterizers.call import INPUTS as INPUTS_OF_ALL
-from sw_rasterizers.native import cuda_ops
+from sw_rasterizers.call import Call, Flag, camera_numbers
 
 INPUTS = ("means", "opacities", "scales", "quats", "sh", "sh_dc", "sh_rest", "colors")
-"""Differentiable inputs in the order in which the ops on CUDA take them and return their gradients."""
+"""Differentiable inputs."""
 OTHERS = {name: None for name in INPUTS_OF_ALL if name not in INPUTS}
 MAPS = {"accumulated": slice(0, 1), "inverse": slice(1, 2), "normals": slice(2, 5), "distortion": slice(5, 6),
         "median": slice(6, 7)}  # fmt: skip
@@ -101,11 +100,9 @@ class SurfelRasterizer:
         self.info.check_geometry(g)
         geometry = [None if x is None else x.detach().contiguous() for x in (g.means, g.scales, g.quats)]
         visible, camera = _as_bytes(g.visible), camera_numbers(cam)
-        if g.means.is_cuda:
-            found: Tensor = cuda_ops().visible_surfel_radii(*geometry, visible, camera, cam.width, cam.height)
-            return found
         call = Call(camera, cam.width, cam.height, 0, 1.0, 0.0, Flag.SURFELS, visible=visible)
-        return cpu.visible_radii(call, dict(zip(("means", "scales", "quats"), geometry, strict=True)))
+        on_device = cuda if g.means.is_cuda else cpu
+        return on_device.visible_radii(call, dict(zip(("means", "scales", "quats"), geometry, strict=True)))
 
     @torch.no_grad()
     def accumulate(self, g: GaussianInputs, cams: Iterable[Camera], opt: RasterOptions) -> AccumOutput:
@@ -152,17 +149,15 @@ class _DrawSurfels(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, call: Call, dummy: Tensor | None, *inputs: Tensor | None) -> tuple[Tensor | None, ...]:
         tensors = [None if x is None else x.detach().contiguous() for x in inputs]
-        on_cuda = tensors[0] is not None and tensors[0].is_cuda
-        ctx.call = call
+        named = _named(tensors)
         ctx.set_materialize_grads(False)
-        if on_cuda:
-            image, radii, alpha, maps, saved, call.counts, seconds = cuda_ops().render_surfels(
-                *tensors, *_settings(call)
-            )
-            call.seconds.update(zip(FORWARD_STAGES, seconds, strict=False))  # only if counting
+        ctx.picture = cpu.Picture(call, named, int(call.flags | Flag.SURFELS))
+        if named["means"].is_cuda:
+            on_cuda = cuda.draw(ctx.picture, named)
+            image, radii, alpha, maps, kept = on_cuda.image, on_cuda.radii, on_cuda.alpha, on_cuda.maps, on_cuda.kept
+            saved: tuple[Tensor, ...] = () if kept is None else kept[:3]
+            ctx.sizes = None if kept is None else kept.sizes
         else:
-            named = _named(tensors)
-            ctx.picture = cpu.Picture(call, named, int(call.flags | Flag.SURFELS))
             drawn = cpu.draw(ctx.picture, named)
             image, radii, alpha, maps = drawn.image, drawn.radii, drawn.alpha, drawn.maps
             saved, ctx.sizes = drawn.kept[:2], drawn.kept[2:]
@@ -174,25 +169,20 @@ class _DrawSurfels(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        image, _, alpha, maps = (None if x is None or x.numel() == 0 else x.contiguous() for x in grads)
-        call: Call = ctx.call
-        tensors, saved = ctx.saved_tensors[: len(INPUTS)], ctx.saved_tensors[len(INPUTS) :]
+        image, _, alpha, maps = (None if x is None else x.contiguous() for x in grads)
+        call: Call = ctx.picture.call
+        named, saved = _named(ctx.saved_tensors[: len(INPUTS)]), ctx.saved_tensors[len(INPUTS) :]
+        means = named["means"]
         if image is None:
-            image = tensors[0].new_zeros(3, call.height, call.width)
-        asked = ctx.needs_input_grad[2:]
+            image = means.new_zeros(3, call.height, call.width)
+        wanted = {name for name, want in zip(INPUTS, ctx.needs_input_grad[2:], strict=True) if want}
+        wanted |= {"grad2d"} if call.grad2d is not None else set()
+        by = {"image": image, "alpha": alpha, "maps": maps}
         if image.is_cuda:
-            wanted = [*asked, call.grad2d is not None]
-            found, seconds = cuda_ops().render_surfels_backward(
-                *tensors, *_settings(call), list(saved), image, alpha, maps, wanted
-            )
-            call.seconds.update(zip(BACKWARD_STAGES, seconds, strict=False))
-            gradients = {name: x for name, x, want in zip((*INPUTS, "grad2d"), found, wanted, strict=True) if want}
+            rows = cuda.blend_backward(ctx.picture, len(means), cuda.Kept(*saved, ctx.sizes), by)
+            gradients = cuda.project_backward(ctx.picture, named, saved[2], rows, wanted, maps=maps is not None)
         else:
-            names = {name for name, want in zip(INPUTS, asked, strict=True) if want}
-            gradients = cpu.draw_backward(
-                ctx.picture, _named(tensors), cpu.Kept(*saved, *ctx.sizes),
-                {"image": image, "alpha": alpha, "maps": maps}, names | ({"grad2d"} if call.grad2d else set()),
-            )  # fmt: skip
+            gradients = cpu.draw_backward(ctx.picture, named, cpu.Kept(*saved, *ctx.sizes), by, wanted)
         if call.grad2d is not None:
             call.grad2d.set(gradients["grad2d"])
         return None, None, *map(gradients.get, INPUTS)
@@ -200,11 +190,6 @@ class _DrawSurfels(torch.autograd.Function):
 
 def _named(tensors: Sequence[Tensor | None]) -> cpu.Tensors:
     return {**OTHERS, **dict(zip(INPUTS, tensors, strict=True))}
-
-
-def _settings(call: Call) -> tuple[Any, ...]:
-    return (call.visible, call.background, call.camera, call.width, call.height, call.sh_degree, call.scale_modifier,
-            int(call.flags))  # fmt: skip
 
 
 def _draw(call: Call, tensors: dict[str, Tensor | None]) -> tuple[Tensor, Tensor, Tensor, Tensor]:

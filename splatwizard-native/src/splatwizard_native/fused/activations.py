@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
+from splatwizard_native.fused import cuda_face
 from splatwizard_native.fused.native import TRAINING
 
 
@@ -15,6 +19,34 @@ def activated(log_scales: Tensor, opacity_logits: Tensor) -> tuple[Tensor, Tenso
     """
     both = log_scales, opacity_logits
     if all(t.is_cuda and t.dtype == torch.float32 for t in both) and TRAINING.has_cuda():
-        found: tuple[Tensor, Tensor] = torch.ops.splatwizard_training.activate(*both)
+        found: tuple[Tensor, Tensor] = _Activate.apply(*both)  # type: ignore[no-untyped-call]
         return found
     return torch.exp(log_scales), torch.sigmoid(opacity_logits)
+
+
+class _Activate(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, log_scales: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
+        log_scales, logits = log_scales.contiguous(), logits.contiguous()
+        scales, opacities = torch.empty_like(log_scales), torch.empty_like(logits)
+        cuda_face.activate(
+            log_scales=log_scales, logits=logits, scale_count=scales.numel(), opacity_count=opacities.numel(),
+            scales=scales, opacities=opacities,
+        )  # fmt: skip
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(scales, opacities)
+        return scales, opacities
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+        wanted = zip(grads, ctx.needs_input_grad, strict=True)
+        given = [g.contiguous() if g is not None and asked else None for g, asked in wanted]
+        made = [None if g is None else torch.empty_like(g) for g in given]
+        scales, opacities = ctx.saved_tensors
+        cuda_face.activate_backward(
+            scales=scales, opacities=opacities, by_scales=given[0], by_opacities=given[1], by_log_scales=made[0],
+            by_logits=made[1], scale_count=0 if given[0] is None else scales.numel(),
+            opacity_count=0 if given[1] is None else opacities.numel(),
+        )  # fmt: skip
+        return made[0], made[1]

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.optim.adam import adam
 
-from splatwizard_native.fused import face
+from splatwizard_native.fused import cuda_face, face
 from splatwizard_native.fused.native import TRAINING
 
 
@@ -39,47 +39,36 @@ def adam_steps(updates: Sequence[AdamUpdate]) -> None:
     All in one call of the kernels, on CUDA in one launch. Raises ValueError before any is done if shapes differ.
     Source: Kingma & Ba (arXiv 1412.6980), bias correction as torch applies it.
     """
-    by_kind: dict[str, list[AdamUpdate]] = {}
+    by_device: dict[torch.device, list[AdamUpdate]] = {}
     for u in updates:
         _check(u)
-        by_kind.setdefault(u.param.device.type, []).append(u)
-    for kind, together in by_kind.items():
-        if kind == "cuda" and TRAINING.has_cuda():
-            together = _on_cuda(together)
-        elif kind == "cpu" and TRAINING.try_load():
-            together = _on_cpu(together)
+        by_device.setdefault(u.param.device, []).append(u)
+    for device, together in by_device.items():
+        if (device.type == "cuda" and TRAINING.has_cuda()) or (device.type == "cpu" and TRAINING.try_load()):
+            together = _fused(together, device)
         for u in together:
             _by_torch(u)
 
 
-def _on_cpu(updates: Sequence[AdamUpdate]) -> list[AdamUpdate]:
-    """Do these updates, all on the CPU; return those that the kernel does not take."""
+def _fused(updates: Sequence[AdamUpdate], device: torch.device) -> list[AdamUpdate]:
+    """Do these updates, of tensors on a device with kernels, in one call; return those that they do not take."""
+    operations: Any = cuda_face if device.type == "cuda" else face
+    alignment, more = (16, {"device": device.index}) if device.type == "cuda" else (1, {})
     rows, held, left = [], [], []
     for u in updates:
         tensors = u.param, u.grad.contiguous(), u.exp_avg, u.exp_avg_sq
-        for t in tensors:
-            if t.dtype is not torch.float32 or not t.is_cpu or not t.is_contiguous():
+        addresses = [t.data_ptr() for t in tensors]
+        for t, at in zip(tensors, addresses, strict=True):
+            if t.dtype is not torch.float32 or t.device != device or at % alignment or not t.is_contiguous():
                 left.append(u)
                 break
         else:
             held.append(tensors)  # alive until the call
-            addresses = [t.data_ptr() for t in tensors]
             rows.append((*addresses, u.param.numel(), u.lr, u.beta1, u.beta2, u.eps, u.step))
-    listed: Any = face.adam_update * len(rows)
-    face.adam(updates=listed(*rows), count=len(rows))
+    listed = operations.adam_update * len(rows)
+    operations.adam(updates=listed(*rows), count=len(rows), **more)
     torch.autograd.graph.increment_version([tensors[0] for tensors in held])
     return left
-
-
-def _on_cuda(updates: Sequence[AdamUpdate]) -> list[AdamUpdate]:
-    """Do these updates, all on CUDA; return those that the kernels do not take."""
-    left = torch.ops.splatwizard_training.adam_many(
-        [u.param for u in updates], [u.grad for u in updates],
-        [u.exp_avg for u in updates], [u.exp_avg_sq for u in updates],
-        [u.lr for u in updates], [u.beta1 for u in updates], [u.beta2 for u in updates],
-        [u.eps for u in updates], [u.step for u in updates],
-    )  # fmt: skip
-    return [updates[i] for i in left]
 
 
 def _check(u: AdamUpdate) -> None:

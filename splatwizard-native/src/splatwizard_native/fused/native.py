@@ -1,8 +1,18 @@
-"""The native module of the fused operations."""
+"""The native modules of the fused operations."""
 
 from __future__ import annotations
 
 from splatwizard_native.module import NativeModule
+
+TRAINING_CUDA = NativeModule(
+    name="splatwizard_training_cuda",
+    package="splatwizard_native.fused",
+    sources=("kernels/cuda/face.cpp",),
+    headers=("kernels/face.h", "kernels/cuda/*.h"),
+    cuda_sources=("kernels/cuda/ssim.cu", "kernels/cuda/adam.cu", "kernels/cuda/activations.cu"),
+    without="activations, loss and optimizer run on torch operations: the same numbers, slower",
+    face="kernels/cuda/face.h",
+)
 
 TRAINING = NativeModule(
     name="splatwizard_training",
@@ -15,12 +25,5 @@ TRAINING = NativeModule(
     cflags=("-fno-math-errno", "-fno-trapping-math"),
     without="loss and optimizer run on torch operations: the same numbers, the loss some six times slower",
     face="kernels/face.h",
-    cuda=NativeModule(
-        name="splatwizard_training_cuda",
-        package="splatwizard_native.fused",
-        sources=("kernels/binding_cuda.cpp",),
-        headers=("kernels/adam_lists.h", "kernels/cuda/*.h"),
-        cuda_sources=("kernels/cuda/ssim.cu", "kernels/cuda/adam.cu", "kernels/cuda/activations.cu"),
-        without="activations, loss and optimizer run on torch operations: the same numbers, slower",
-    ),
+    cuda=TRAINING_CUDA,
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -10,11 +11,12 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
-from splatwizard_native.fused import face
+from splatwizard_native.fused import cuda_face, face
 from splatwizard_native.fused.native import TRAINING
 
 Padding = Literal["same", "valid"]
 
+TILE = 32  # pixels of a block of the CUDA kernel, each way
 RADIUS = 5  # 11 x 11 window
 SIGMA = 1.5
 C1 = 0.01**2
@@ -41,30 +43,49 @@ def photometric(
 
 
 class _Photometric(torch.autograd.Function):
-    """offset + l1_weight * L1 + ssim_weight * SSIM, and both means. The gradient is computed along with the value."""
+    """offset + l1_weight * L1 + ssim_weight * SSIM, and both means.
+
+    On the CPU the gradient is computed along with the value; on CUDA no number is waited for, and the gradient is put
+    together when its scale is known.
+    """
 
     @staticmethod
     def forward(
-        ctx: Any, x: Tensor, y: Tensor, valid: bool, l1_weight: float, ssim_weight: float, offset: float
-    ) -> tuple[Tensor, Tensor, Tensor]:
+        ctx: Any, learns: bool, x: Tensor, y: Tensor, valid: bool, l1_weight: float, ssim_weight: float, offset: float
+    ) -> tuple[Tensor, ...]:
         image, target = (t.reshape(-1, *t.shape[-2:]).contiguous() for t in (x, y))
-        grad = torch.empty_like(image) if ctx.needs_input_grad[0] else None
-        found = face.photometric(
-            x=image, y=target, valid=valid, l1_weight=l1_weight, ssim_weight=ssim_weight, grad=grad,
-            row_sums=image.new_empty(2, *image.shape[:2], dtype=torch.float64),
-        )  # fmt: skip
-        ctx.save_for_backward(None if grad is None else grad.view(x.shape))
-        parts = x.new_tensor(found.l1), x.new_tensor(found.ssim)
-        ctx.mark_non_differentiable(*parts)
-        return x.new_tensor(offset + l1_weight * found.l1 + ssim_weight * found.ssim), *parts
+        ctx.weights, ctx.shape = {"valid": valid, "l1_weight": l1_weight, "ssim_weight": ssim_weight}, x.shape
+        planes, height, width = image.shape
+        if x.is_cuda:
+            # Each a tensor of its own: views of one could not be changed in place.
+            total, l1, similarity = found = tuple(image.new_empty(()) for _ in range(3))
+            slopes = image.new_empty(3, *image.shape) if learns else None
+            cuda_face.photometric_loss(
+                x=image, y=target, **ctx.weights, offset=offset, total=total, l1=l1, ssim=similarity, slopes=slopes,
+                sums=image.new_empty(2 + 2 * planes * -(-height // TILE) * -(-width // TILE)),
+            )  # fmt: skip
+            ctx.save_for_backward(image, target, slopes)
+        else:
+            grad = torch.empty_like(image) if learns else None
+            row_sums = image.new_empty(2, planes, height, dtype=torch.float64)
+            told = face.photometric(x=image, y=target, **ctx.weights, grad=grad, row_sums=row_sums)
+            sums = offset + l1_weight * told.l1 + ssim_weight * told.ssim, told.l1, told.ssim
+            found = tuple(map(x.new_tensor, sums))
+            ctx.save_for_backward(grad)
+        ctx.mark_non_differentiable(*found[1:])
+        return found
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad_output: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
-        (grad,) = ctx.saved_tensors
-        # Nearly always the loss itself is differentiated: then there is nothing to multiply.
-        scaled = grad if grad is None or float(grad_output) == 1.0 else grad * grad_output
-        return scaled, None, None, None, None, None
+    def backward(ctx: Any, scale: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
+        if scale.is_cuda:
+            x, y, slopes = ctx.saved_tensors
+            grad = torch.empty_like(x)
+            cuda_face.photometric_loss_backward(x=x, y=y, slopes=slopes, **ctx.weights, scale=scale, grad=grad)
+        else:
+            (grad,) = ctx.saved_tensors
+            grad = grad if float(scale) == 1.0 else grad * scale  # nearly always the loss itself is differentiated
+        return None, grad.view(ctx.shape), *[None] * 5
 
 
 def ssim_map(x: Tensor, y: Tensor, padding: Padding = "same") -> Tensor:
@@ -90,7 +111,5 @@ def _fused(x: Tensor, y: Tensor) -> Callable[..., tuple[Tensor, Tensor, Tensor]]
     """Return the fused loss that takes these images; None: torch operations do."""
     if x.dtype != torch.float32 or y.requires_grad:
         return None
-    if x.is_cuda:
-        # A node in C++, where no number is waited for: one in Python took the host as long as the kernels the device.
-        return torch.ops.splatwizard_training.photometric_loss if TRAINING.has_cuda() else None
-    return _Photometric.apply if x.device.type == "cpu" and TRAINING.try_load() else None
+    fused = TRAINING.has_cuda() if x.is_cuda else x.device.type == "cpu" and TRAINING.try_load()
+    return partial(_Photometric.apply, torch.is_grad_enabled() and x.requires_grad) if fused else None

@@ -9,50 +9,38 @@ import torch
 from torch import Tensor
 
 from splatwizard_native import AdamUpdate
-from sw_gaussians import face
+from sw_gaussians import cuda_face, face
 from sw_gaussians.native import GAUSSIANS
+
+MOST_WIDTH = 1 << 20  # numbers of a row that the kernel on CUDA takes
 
 
 def left_of(updates: Sequence[AdamUpdate], rows: Tensor) -> list[AdamUpdate]:
     """Run the updates that a kernel supports, for the marked rows [N] bool; return the others."""
-    if not updates:
-        return []
-    if rows.is_cuda and GAUSSIANS.has_cuda():
-        return _on_cuda(updates, rows)
-    return _on_cpu(updates, rows) if rows.is_cpu and GAUSSIANS.try_load() else list(updates)
-
-
-def _on_cuda(updates: Sequence[AdamUpdate], rows: Tensor) -> list[AdamUpdate]:
-    """Do these updates, for rows on CUDA; return those that the kernel does not take."""
-    nothing = rows.new_empty(0, dtype=torch.int32)
-    undone = torch.ops.splatwizard_gaussians.sparse_adam_many(
-        [u.param for u in updates], [u.grad.contiguous() for u in updates],
-        [u.exp_avg for u in updates], [u.exp_avg_sq for u in updates],
-        [nothing for _ in updates], rows.contiguous(),
-        [u.lr for u in updates], [u.beta1 for u in updates], [u.beta2 for u in updates], [u.eps for u in updates],
-    )  # fmt: skip
-    _written(updates)
-    return [updates[i] for i in undone]
-
-
-def _on_cpu(updates: Sequence[AdamUpdate], rows: Tensor) -> list[AdamUpdate]:
-    """Do these updates, for rows on the CPU; return those that the kernel does not take."""
-    listed, held, done, left = [], [], [], []
+    if not updates or not (GAUSSIANS.has_cuda() if rows.is_cuda else rows.is_cpu and GAUSSIANS.try_load()):
+        return list(updates)
+    operations, alignment = (cuda_face, 16) if rows.is_cuda else (face, 1)
+    listed, held, left = [], [], []
     for u in updates:
         tensors = u.param, u.grad.contiguous(), u.exp_avg, u.exp_avg_sq
-        if all(t.is_cpu and t.dtype is torch.float32 and t.is_contiguous() for t in tensors):
-            width = u.param.numel() // max(len(rows), 1)
+        width = u.param.numel() // max(len(rows), 1)
+        if all(_fits(t, rows, alignment) for t in tensors) and width < MOST_WIDTH:
             listed.append((*(t.data_ptr() for t in tensors), width, u.lr, u.beta1, u.beta2, u.eps))
             held.append(tensors)  # alive until the call
-            done.append(u)
         else:
             left.append(u)
-    kind: Any = face.sparse_update * len(listed)
-    face.sparse_adam(updates=kind(*listed), count=len(listed), marked=rows.contiguous())
-    _written(done)
+    kind: Any = operations.sparse_update * len(listed)
+    operations.sparse_adam(updates=kind(*listed), count=len(listed), marked=rows.contiguous())
+    torch.autograd.graph.increment_version([t for param, _, *moments in held for t in (param, *moments)])
     return left
 
 
-def _written(updates: Sequence[AdamUpdate]) -> None:
-    """Bump autograd's version counters of tensors that a kernel has written."""
-    torch.autograd.graph.increment_version([t for u in updates for t in (u.param, u.exp_avg, u.exp_avg_sq)])
+def _fits(t: Tensor, rows: Tensor, alignment: int) -> bool:
+    """Whether a kernel takes a tensor: float32 without gaps, where the marks are and with a row for each of them."""
+    return (
+        t.dtype is torch.float32
+        and t.device == rows.device
+        and t.is_contiguous()
+        and t.shape[:1] == rows.shape
+        and t.data_ptr() % alignment == 0
+    )

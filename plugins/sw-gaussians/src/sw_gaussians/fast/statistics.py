@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.api import GaussianModel
+from sw_gaussians import cuda_face
 from sw_gaussians.native import GAUSSIANS
 
 
@@ -14,7 +15,9 @@ def accumulate(model: GaussianModel, gradients: Tensor, radii: Tensor) -> bool:
     sums = model.grad_accum, model.denom, model.max_radii2d
     fits = _fits_kernel(gradients, radii, sums) and GAUSSIANS.has_cuda()
     if fits:
-        torch.ops.splatwizard_gaussians.view_statistics(gradients, radii, *sums)
+        cuda_face.view_statistics(
+            gradients=gradients, radii=radii, grad_accum=sums[0], denom=sums[1], max_radii=sums[2]
+        )
     return fits
 
 
@@ -22,10 +25,18 @@ def accumulate_fragments(
     sums: Tensor, gradients: Tensor, logits: Tensor, fragments: Tensor, *, least_clear: float
 ) -> bool:
     """Do what `density.fragments.accumulate_fragments_in_torch` does, where the kernel can; return whether it could."""
-    if not (sums.is_cuda and GAUSSIANS.has_cuda()):
-        return False
-    fragment_statistics = torch.ops.splatwizard_gaussians.fragment_statistics
-    return bool(fragment_statistics(gradients, logits, fragments, sums, least_clear))
+    tensors = gradients, logits, fragments, sums
+    plain = all(t.is_cuda and t.dtype == torch.float32 and t.is_contiguous() for t in tensors)
+    fits = plain and fragments.data_ptr() % 8 == 0 and GAUSSIANS.has_cuda()
+    if fits:
+        cuda_face.fragment_statistics(
+            gradients=gradients.view(-1),
+            logits=logits.view(-1),
+            fragments=fragments,
+            sums=sums,
+            least_clear=least_clear,
+        )
+    return fits
 
 
 def _fits_kernel(gradients: Tensor, radii: Tensor, sums: tuple[Tensor, ...]) -> bool:

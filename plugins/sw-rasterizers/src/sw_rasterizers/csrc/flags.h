@@ -25,7 +25,7 @@ enum Flag : int64_t {  // mirrored in ops.py
   kForScores = 65536,  // with kSave: nothing that only the backward pass needs
   kOrdered = 131072,   // CUDA: sums of the backward pass in one order; on the CPU they always are
   kFragments = 262144,
-  kSurfels = 1 << 19,  // CPU: scales [N,2]
+  kSurfels = 1 << 19,  // scales [N,2]
   kWithMaps = 1 << 20,  // of surfels: depth, normals, distortion
 };
 

@@ -36,10 +36,8 @@ struct SparseAdamTensor {
   const float* grad;
   float* exp_avg;
   float* exp_avg_sq;
-  int32_t* row_steps;  // [rows] updates of each row so far, counted up; null: no bias correction
-  int64_t width;       // below 2^20
-  float lr, log_beta1, log_beta2;
-  float one_minus_beta1, beta2, one_minus_beta2, eps;
+  int64_t width;  // below 2^20
+  float lr, one_minus_beta1, beta2, one_minus_beta2, eps;
 };
 
 constexpr int kSparseAdamTensors = 16;  // of one launch

@@ -1,8 +1,7 @@
 // Adam of the rows that a mask marks, of many tensors in one launch; as sparse_adam.cpp computes it.
 //
-// A block owns kRows rows of one tensor: a thread a row looks at the mask, counts the row's updates and works out its
-// rates, then all walk the rows' values, which lie in one run. Of four values that lie together nothing is read unless a
-// marked row has one of them.
+// A block owns kRows rows of one tensor: a thread a row looks at the mask, then all walk the rows' values, which lie in
+// one run. Of four values that lie together nothing is read unless a marked row has one of them.
 #include "kernels.h"
 
 namespace splatwizard::cuda {
@@ -17,34 +16,21 @@ struct Batch {
   int64_t rows;
 };
 
-struct Rates {
-  float step_size;  // lr / (1 - b1^t); negative: the row is not marked
-  float inv_bias2;  // 1 / sqrt(1 - b2^t)
-};
-
-__device__ __forceinline__ void update(const SparseAdamTensor& a, const Rates& rates, float& p, float g, float& m,
-                                       float& v) {
-  if (rates.step_size < 0.f) return;
+__device__ __forceinline__ void update(const SparseAdamTensor& a, bool marked, float& p, float g, float& m, float& v) {
+  if (!marked) return;
   m = m + a.one_minus_beta1 * (g - m);
   v = a.beta2 * v + a.one_minus_beta2 * g * g;
-  p -= rates.step_size * m / (sqrtf(v) * rates.inv_bias2 + a.eps);
+  p -= a.lr * m / (sqrtf(v) + a.eps);
 }
 
 __global__ void __launch_bounds__(kThreads) sparse_adam_kernel(const __grid_constant__ Batch batch) {
-  __shared__ Rates rates[kRows];
+  __shared__ bool marks[kRows];
   const int64_t first = int64_t(blockIdx.x) * kRows;
   const SparseAdamTensor& a = batch.tensors[blockIdx.y];
   const int rows = int(batch.rows - first < kRows ? batch.rows - first : kRows), row = int(threadIdx.x);
   const bool marked = row < rows && batch.mask[first + row];
   if (!__syncthreads_or(marked)) return;
-  if (row < rows) {
-    Rates own{marked ? a.lr : -1.f, 1.f};
-    if (marked && a.row_steps != nullptr) {
-      const float t = float(++a.row_steps[first + row]);
-      own = {a.lr / -expm1f(t * a.log_beta1), rsqrtf(-expm1f(t * a.log_beta2))};
-    }
-    rates[row] = own;
-  }
+  if (row < rows) marks[row] = marked;
   __syncthreads();
 
   const int64_t begin = first * a.width;
@@ -65,22 +51,22 @@ __global__ void __launch_bounds__(kThreads) sparse_adam_kernel(const __grid_cons
     if (i + 4 <= values) {
       bool any = false;
 #pragma unroll
-      for (int k = 0; k < 4; ++k) any |= rates[at[k]].step_size >= 0.f;
+      for (int k = 0; k < 4; ++k) any |= marks[at[k]];
       if (!any) continue;
       const float4 g4 = __ldcs(reinterpret_cast<const float4*>(g + i));
       float4 m4 = __ldcs(reinterpret_cast<const float4*>(m + i)), v4 = __ldcs(reinterpret_cast<const float4*>(v + i));
       float4 p4 = *reinterpret_cast<const float4*>(p + i);
-      update(a, rates[at[0]], p4.x, g4.x, m4.x, v4.x);
-      update(a, rates[at[1]], p4.y, g4.y, m4.y, v4.y);
-      update(a, rates[at[2]], p4.z, g4.z, m4.z, v4.z);
-      update(a, rates[at[3]], p4.w, g4.w, m4.w, v4.w);
+      update(a, marks[at[0]], p4.x, g4.x, m4.x, v4.x);
+      update(a, marks[at[1]], p4.y, g4.y, m4.y, v4.y);
+      update(a, marks[at[2]], p4.z, g4.z, m4.z, v4.z);
+      update(a, marks[at[3]], p4.w, g4.w, m4.w, v4.w);
       *reinterpret_cast<float4*>(p + i) = p4;
       __stcs(reinterpret_cast<float4*>(m + i), m4);
       __stcs(reinterpret_cast<float4*>(v + i), v4);
     } else {
 #pragma unroll
       for (int k = 0; k < 4; ++k)
-        if (i + k < values) update(a, rates[at[k]], p[i + k], g[i + k], m[i + k], v[i + k]);
+        if (i + k < values) update(a, marks[at[k]], p[i + k], g[i + k], m[i + k], v[i + k]);
     }
   }
 }

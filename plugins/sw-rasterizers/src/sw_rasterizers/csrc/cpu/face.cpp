@@ -72,24 +72,6 @@ void draw(draw_call& call, const Parallel& parallel) {
 }
 
 template <class S>
-Gradients<S> gradients_of(const draw_backward_call& call, const Gaussians<S>& g) {
-  Gradients<S> out{};
-  out.means = numbers<S>(call.of_means), out.opacities = numbers<S>(call.of_opacities);
-  out.scales = numbers<S>(call.of_scales), out.quats = numbers<S>(call.of_quats);
-  out.cov3d = numbers<S>(call.of_cov3d), out.colors = numbers<S>(call.of_colors);
-  out.features = numbers<S>(call.of_features), out.scale_factors = numbers<S>(call.of_scale_factors);
-  out.grad2d = numbers<S>(call.of_grad2d), out.absgrad2d = numbers<S>(call.of_absgrad2d);
-  if (call.of_sh != nullptr) {
-    out.sh_dc = numbers<S>(call.of_sh), out.sh_dc_stride = out.sh_rest_stride = g.sh_dc_stride;
-    if (call.sh_rows > 1) out.sh_rest = out.sh_dc + 3;
-  } else {
-    out.sh_dc = numbers<S>(call.of_sh_dc), out.sh_dc_stride = 3;
-    out.sh_rest = numbers<S>(call.of_sh_rest), out.sh_rest_stride = g.sh_rest_stride;
-  }
-  return out;
-}
-
-template <class S>
 void draw_backward(draw_backward_call& call, const Parallel& parallel) {
   const auto view = view_of<S>(call);
   const auto g = gaussians_of<S>(call);
@@ -111,7 +93,7 @@ void draw_backward(draw_backward_call& call, const Parallel& parallel) {
   const bool shared = g.shape_rows != nullptr && (call.of_scales != nullptr || call.of_quats != nullptr);
   const Sums<S> sums(call.sums, call.pairs, columns, g.count, shared ? g.shapes : 0);
   sums.layout.check("sums", call.sum_bytes);
-  auto out = gradients_of(call, g);
+  auto out = gradients_of<S>(call, g);
   out.shape_sums = sums.shapes;
 
   Clock clock;

@@ -264,6 +264,8 @@ typedef struct {
   const int64_t* offsets;        // [entries + 1] where those of a row begin in it
   const sw_real* by_colors;      // [count, 3]
   sw_real* passed;               // [count, 3] scratch
+  float* carried;                // [runs, 48] or null: on a GPU scratch, a run for 128 Gaussians
+  int64_t runs;
   sw_real* of_codebook;          // [entries, coefficients, 3]
   sw_real* of_means;             // [count, 3]
   sw_real* of_dc;                // [count, 1, 3] or null

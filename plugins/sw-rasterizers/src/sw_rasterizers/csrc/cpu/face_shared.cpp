@@ -3,30 +3,15 @@
 
 #include "shared_colors.h"
 #include "face.h"
-#include "face_inputs.h"
+#include "../face_shared_inputs.h"
 
 namespace {
 
 using namespace sw;  // NOLINT: one file
 
-template <class S, class Call>
-SharedColors<S> shared_of(const Call& call, const Parallel& parallel) {
-  constexpr int64_t most = std::numeric_limits<int32_t>::max();
-  const int first = call.dc != nullptr;
-  const int64_t basis = (call.degree + 1) * (call.degree + 1);
-  if (call.degree < 0 || call.degree > 3 || (call.count > 0 && call.coefficients + first < basis))
-    refuse("SH degree %d needs %lld coefficients, got %lld", int(call.degree), (long long)basis,
-           (long long)(call.coefficients + first));
-  if (call.count < 0 || call.count >= most || call.entries < 0 || call.entries >= most)
-    refuse("%lld Gaussians, %lld entries: at most 2^31 - 2", (long long)call.count, (long long)call.entries);
-  return {call.count, call.entries, numbers<S>(call.means), numbers<S>(call.dc), numbers<S>(call.codebook),
-          3 * call.coefficients, first, call.rows, numbers<S>(call.center), int(call.degree), call.clamp != 0,
-          &parallel};
-}
-
 template <class S>
 void backward(const shade_shared_backward_call& call, const Parallel& parallel) {
-  const auto shared = shared_of<S>(call, parallel);
+  const auto shared = shared_of<S>(call, &parallel);
   S* const passed = numbers<S>(call.passed);
   S* const codebook = numbers<S>(call.of_codebook);
   if (call.count == 0) {
@@ -43,7 +28,7 @@ void backward(const shade_shared_backward_call& call, const Parallel& parallel) 
 SW_OPERATION(sw_rasterizers, shade_shared) {
   return with_numbers(call, [&](auto number, const Parallel& parallel) {
     using S = decltype(number);
-    const auto shared = shared_of<S>(*call, parallel);
+    const auto shared = shared_of<S>(*call, &parallel);
     if (call->count > 0) SW_SELECT(shade_shared<S>)(shared, numbers<S>(call->colors));
   });
 }

@@ -2,7 +2,7 @@
 #pragma once
 
 #include "surfel_kernels.h"
-#include "face_inputs.h"
+#include "../face_inputs.h"
 
 namespace sw {
 

@@ -1,4 +1,4 @@
-// The CUDA kernels: plain pointers, sizes and a stream, no torch. binding_cuda.cpp owns the memory. float32 only.
+// The CUDA kernels: plain pointers, sizes and a stream; the memory is the caller's (face.h). float32 only.
 //
 //   project            N Gaussians -> splats of the drawn ones, compact and in index order; counts their tiles
 //   shade              colours of the splats

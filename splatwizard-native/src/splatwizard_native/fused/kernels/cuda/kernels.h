@@ -24,8 +24,11 @@ struct PhotometricSums {
 };
 int64_t photometric_blocks(const Photometric& args);
 
-// means [3]: the total, the mean of |x-y|, the mean of the SSIM map.
-void photometric(const Photometric& args, const PhotometricSums& sums, float* means, cudaStream_t stream);
+struct PhotometricMeans {  // one number each
+  float *total, *l1, *ssim;
+};
+void photometric(const Photometric& args, const PhotometricSums& sums, const PhotometricMeans& means,
+                 cudaStream_t stream);
 // grad [planes, height, width] = *scale d total / d x, from the slopes.
 void photometric_backward(const Photometric& args, const float* scale, float* grad, cudaStream_t stream);
 

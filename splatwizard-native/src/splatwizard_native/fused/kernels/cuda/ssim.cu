@@ -75,7 +75,7 @@ __device__ __forceinline__ void blur_column(const float (*from)[kTile], int firs
 constexpr int kTasks = kHalo * kTile / 4;  // of the horizontal blur
 
 __global__ void __launch_bounds__(kThreads)
-    forward_kernel(Photometric a, PhotometricSums sums, float* means, float ssim_scale) {
+    forward_kernel(Photometric a, PhotometricSums sums, PhotometricMeans means, float ssim_scale) {
   __shared__ __align__(16) float x_tile[kHalo][kPitch], y_tile[kHalo][kPitch];
   __shared__ __align__(16) float moments[5][kHalo][kTile];  // x, y, x^2, y^2, xy, blurred along rows
   __shared__ float partial[2][kThreads / 32];
@@ -168,8 +168,8 @@ __global__ void __launch_bounds__(kThreads)
   const double pixels = double(a.planes) * a.height * a.width;
   const double counted = double(a.planes) * (a.height - 2 * lost) * (a.width - 2 * lost);
   const double mean_l1 = total[0] / pixels, mean_ssim = total[1] / counted;
-  means[0] = float(a.l1_weight * mean_l1 + a.ssim_weight * mean_ssim + a.offset);
-  means[1] = float(mean_l1), means[2] = float(mean_ssim);
+  *means.total = float(a.l1_weight * mean_l1 + a.ssim_weight * mean_ssim + a.offset);
+  *means.l1 = float(mean_l1), *means.ssim = float(mean_ssim);
 }
 
 __global__ void __launch_bounds__(kThreads)
@@ -220,7 +220,8 @@ int64_t photometric_blocks(const Photometric& args) {
   return int64_t(blocks.x) * blocks.y * blocks.z;
 }
 
-void photometric(const Photometric& args, const PhotometricSums& sums, float* means, cudaStream_t stream) {
+void photometric(const Photometric& args, const PhotometricSums& sums, const PhotometricMeans& means,
+                 cudaStream_t stream) {
   const int lost = args.valid ? 2 * kRadius : 0;
   const double counted = double(args.planes) * (args.height - lost) * (args.width - lost);
   forward_kernel<<<grid(args), kThreads, 0, stream>>>(args, sums, means, float(args.ssim_weight / counted));

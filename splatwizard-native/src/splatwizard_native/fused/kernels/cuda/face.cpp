@@ -1,0 +1,83 @@
+#include "face.h"
+
+#include <splatwizard/cuda_face.h>
+
+#include <cmath>
+#include <limits>
+
+#include "kernels.h"
+
+using splatwizard::guarded_on_gpu;
+using splatwizard::refuse;
+namespace kernels = splatwizard::cuda;
+
+namespace {
+
+template <class Call>
+kernels::Photometric photometric_of(const Call& call) {
+  const int64_t lost = call.valid ? 10 : 0, most = std::numeric_limits<int>::max();
+  if (call.planes < 1 || call.height <= lost || call.width <= lost)
+    refuse("the image of %lld x %lld is too small", (long long)call.height, (long long)call.width);
+  // Limits of a launch: planes and rows of tiles.
+  if (call.planes > 65535 || call.height > 65535 * 32 || call.width > most / 2)
+    refuse("%lld images of %lld x %lld are too large", (long long)call.planes, (long long)call.height,
+           (long long)call.width);
+  return {call.x, call.y, int(call.planes), int(call.height), int(call.width), call.valid, call.l1_weight,
+          call.ssim_weight, 0., nullptr};
+}
+
+}  // namespace
+
+SW_OPERATION(splatwizard_training_cuda, photometric_loss) {
+  return guarded_on_gpu(call, [&](cudaStream_t stream) {
+    kernels::Photometric args = photometric_of(*call);
+    args.offset = call->offset, args.slopes = call->slopes;
+    const int64_t needed = 2 + 2 * kernels::photometric_blocks(args);
+    if (call->sum_count < needed) refuse("sums has %lld numbers, not %lld", (long long)call->sum_count, (long long)needed);
+    splatwizard::check(cudaMemsetAsync(call->sums, 0, sizeof(float2), stream));
+    auto* const places = reinterpret_cast<float2*>(call->sums);
+    kernels::photometric(args, {reinterpret_cast<unsigned*>(places), places + 1}, {call->total, call->l1, call->ssim},
+                         stream);
+  });
+}
+
+SW_OPERATION(splatwizard_training_cuda, photometric_loss_backward) {
+  return guarded_on_gpu(call, [&](cudaStream_t stream) {
+    kernels::Photometric args = photometric_of(*call);
+    args.slopes = const_cast<float*>(call->slopes);
+    kernels::photometric_backward(args, call->scale, call->grad, stream);
+  });
+}
+
+SW_OPERATION(splatwizard_training_cuda, activate) {
+  return guarded_on_gpu(call, [&](cudaStream_t stream) {
+    kernels::activate({call->log_scales, call->scale_count, call->logits, call->opacity_count}, call->scales,
+                      call->opacities, stream);
+  });
+}
+
+SW_OPERATION(splatwizard_training_cuda, activate_backward) {
+  return guarded_on_gpu(call, [&](cudaStream_t stream) {
+    kernels::activate_backward({call->scales, call->scale_count, call->opacities, call->opacity_count},
+                               call->by_scales, call->by_opacities, call->by_log_scales, call->by_logits, stream);
+  });
+}
+
+SW_OPERATION(splatwizard_training_cuda, adam) {
+  return guarded_on_gpu(call, [&](cudaStream_t stream) {
+    kernels::AdamTensor tensors[kernels::kAdamTensors];
+    int held = 0;
+    for (int64_t i = 0; i < call->count; ++i) {
+      const adam_update& u = call->updates[i];
+      if (u.step < 1 || u.count < 0) refuse("update %lld has step %lld of %lld numbers", (long long)i,
+                                            (long long)u.step, (long long)u.count);
+      const double t = double(u.step);
+      tensors[held++] = {u.param, u.grad, u.exp_avg, u.exp_avg_sq, u.count, float(u.lr / (1. - std::pow(u.beta1, t))),
+                         float(1. - u.beta1), float(u.beta2), float(1. - u.beta2),
+                         float(1. / std::sqrt(1. - std::pow(u.beta2, t))), float(u.eps), 0};
+      if (held < kernels::kAdamTensors && i + 1 < call->count) continue;
+      kernels::adam(tensors, held, stream);
+      held = 0;
+    }
+  });
+}

@@ -1,0 +1,61 @@
+// The fused operations of training on a GPU: what C and Python call. See <splatwizard/c_face.h> for the form.
+#pragma once
+#include "../face.h"
+
+// total = offset + l1_weight * l1 + ssim_weight * ssim of two images; the host waits for none of them.
+typedef struct {
+  sw_head head;
+  const float* x;         // [planes, height, width] the image that is trained
+  const float* y;         // [planes, height, width] the picture
+  int64_t planes, height, width;
+  bool valid;             // SSIM only where the window lies inside the image; otherwise zero padding
+  double l1_weight, ssim_weight, offset;
+  float* total;           // one number
+  float* l1;              // one number: the mean of |x-y|
+  float* ssim;            // one number: the mean of the SSIM map
+  float* slopes;          // [3, planes, height, width] or null: what the backward pass needs
+  float* sums;            // [sum_count] scratch: two, and two for each 32 x 32 pixels of each plane, or more
+  int64_t sum_count;
+} photometric_loss_call;
+SW_OPERATION(splatwizard_training_cuda, photometric_loss);
+
+// The gradient of a loss by x, from that by `total`.
+typedef struct {
+  sw_head head;
+  const float* x;         // [planes, height, width]
+  const float* y;         // [planes, height, width]
+  const float* slopes;    // [3, planes, height, width] of `photometric_loss` with the same images and weights
+  int64_t planes, height, width;
+  bool valid;
+  double l1_weight, ssim_weight;
+  const float* scale;     // one number
+  float* grad;            // [planes, height, width]
+} photometric_loss_backward_call;
+SW_OPERATION(splatwizard_training_cuda, photometric_loss_backward);
+
+// exp of log scales, sigmoid of opacity logits.
+typedef struct {
+  sw_head head;
+  const float* log_scales;  // `scale_count` numbers
+  const float* logits;      // `opacity_count` numbers
+  int64_t scale_count, opacity_count;
+  float* scales;
+  float* opacities;
+} activate_call;
+SW_OPERATION(splatwizard_training_cuda, activate);
+
+// Gradients by what `activate` was given, from its results and the gradients by these; a count of 0 leaves one out.
+typedef struct {
+  sw_head head;
+  const float* scales;
+  const float* opacities;
+  int64_t scale_count, opacity_count;
+  const float* by_scales;     // or null
+  const float* by_opacities;  // or null
+  float* by_log_scales;       // or null
+  float* by_logits;           // or null
+} activate_backward_call;
+SW_OPERATION(splatwizard_training_cuda, activate_backward);
+
+// One step of Adam of all, 24 in a launch; tensors start at multiples of 16 bytes.
+SW_OPERATION(splatwizard_training_cuda, adam);
