@@ -1,4 +1,4 @@
-"""Operations of plain C faces on CUDA are called by their wrappers as headers say; stand-ins do for GPU and library."""
+"""Every operation on CUDA is called by its wrapper as its header says; stand-ins do for GPU and libraries."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import ctypes
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,11 +15,13 @@ from sw_doctor.building import resolve_module
 from sw_doctor.declared_modules import declared_modules
 
 from splatwizard_core.plugins import load_plugins
-from splatwizard_native import NativeModule
+from splatwizard_native import AdamUpdate, NativeModule, offer_update
 from splatwizard_native import face as native_face
 from splatwizard_native.face import OPERATION, read_structs, structure
 
 STREAM = 4711
+RESULTS: dict[str, dict[str, int]] = {}
+"""What operations tell, where it is not 0."""
 DECLARED = [resolve_module(target) for target in declared_modules(load_plugins())]
 MODULES = [m.cuda for m in DECLARED if m.cuda is not None and m.cuda.face]
 
@@ -44,6 +47,8 @@ class Library:
             assert (handed.size, handed.abi) == (ctypes.sizeof(kind), native_face.ABI)
             assert (handed.device, handed.stream) == (0, STREAM)
             self.calls.setdefault(operation, []).append(handed)
+            for field, value in RESULTS.get(operation, {}).items():
+                setattr(reference._obj, field, value)
             return 0
 
         return call
@@ -69,6 +74,258 @@ def calls(monkeypatch) -> Iterator[dict[str, list[Any]]]:
     for face, names in zip(faces, before, strict=True):
         for name in set(vars(face)) - set(names):
             delattr(face, name)
+
+
+def test_training(calls):
+    from splatwizard_native.fused.activations import activated
+    from splatwizard_native.fused.adam import AdamUpdate, adam_steps
+    from splatwizard_native.fused.photometric import photometric
+
+    x, y = rand(3, 40, 70, grad=True), rand(3, 40, 70)
+    total, _, _ = photometric(x, y, 0.2)
+    (grad,) = torch.autograd.grad(total, x, torch.ones(()))
+    assert grad.shape == x.shape
+    (first,) = calls["photometric_loss"]
+    assert (first.planes, first.height, first.width, first.valid, first.sum_count) == (3, 40, 70, False, 2 + 2 * 18)
+    assert (first.l1_weight, first.ssim_weight, first.offset) == (0.8, -0.2, 0.2)
+    (back,) = calls["photometric_loss_backward"]
+    assert (back.slopes, back.grad) == (first.slopes, grad.data_ptr())
+    with torch.no_grad():
+        photometric(x, y, 0.2, "valid")
+    assert (calls["photometric_loss"][1].slopes, calls["photometric_loss"][1].valid) == (None, True)
+
+    log_scales, logits = rand(5, 3, grad=True), rand(5, grad=True)
+    _, opacities = activated(log_scales, logits)
+    assert (calls["activate"][0].scale_count, calls["activate"][0].opacity_count) == (15, 5)
+    torch.autograd.grad(opacities, logits, rand(5))
+    (back,) = calls["activate_backward"]
+    assert (back.scale_count, back.opacity_count, back.by_scales, back.by_log_scales) == (0, 5, None, None)
+    assert back.opacities == opacities.data_ptr()
+
+    update = AdamUpdate(*(rand(4, 4) for _ in range(4)), lr=0.1, beta1=0.9, beta2=0.99, eps=1e-8, step=1)
+    version = update.param._version
+    adam_steps([update, update])
+    assert calls["adam"][0].count == 2
+    assert update.param._version > version
+
+
+def test_gaussians(calls):
+    from sw_gaussians.fast.sparse_adam import left_of
+    from sw_gaussians.fast.statistics import accumulate, accumulate_fragments
+    from sw_gaussians.surface_losses import _disagreement
+
+    from splatwizard_native import AdamUpdate
+
+    updates = [AdamUpdate(*(rand(6, width) for _ in range(4)), 0.1, 0.9, 0.99, 1e-8, 1) for width in (1, 4)]
+    updates.append(AdamUpdate(*(rand(7, 2) for _ in range(4)), 0.1, 0.9, 0.99, 1e-8, 1))
+    assert left_of(updates, torch.ones(6, dtype=torch.bool)) == updates[2:]
+    assert (calls["sparse_adam"][0].count, calls["sparse_adam"][0].rows) == (2, 6)
+
+    sums = SimpleNamespace(grad_accum=rand(5), denom=rand(5), max_radii2d=rand(5))
+    assert accumulate(sums, rand(5, 2), torch.ones(5, dtype=torch.int32))
+    assert calls["view_statistics"][0].rows == 5
+    assert accumulate_fragments(rand(5, 3), rand(5), rand(5), rand(5, 2), least_clear=0.5)
+    assert calls["fragment_statistics"][0].least_clear == 0.5
+    assert not accumulate_fragments(rand(5, 3), rand(5), rand(5).double(), rand(5, 2), least_clear=0.5)
+
+    depth, normals = rand(1, 4, 6, grad=True), rand(3, 4, 6, grad=True)
+    lens = SimpleNamespace(fx=1.0, fy=2.0, cx=3.0, cy=4.0)
+    found = _disagreement(depth, normals, rand(1, 4, 6), lens)
+    to_depth, to_normals = torch.autograd.grad(found, (depth, normals), rand(1, 4, 6))
+    (back,), (there,) = calls["disagreement_backward"], calls["disagreement"]
+    assert (back.depth, back.alpha) == (there.depth, there.alpha)
+    assert (back.height, back.width, back.fx, back.fy, back.cx, back.cy) == (4, 6, 1, 2, 3, 4)
+    assert (back.to_depth, back.to_normals) == (to_depth.data_ptr(), to_normals.data_ptr())
+
+
+@pytest.fixture
+def drawn(calls, monkeypatch):
+    """The calls, where every picture has room for its 7 splats and 20 pairs."""
+    from sw_rasterizers import cuda
+
+    monkeypatch.setattr(cuda, "_MAILBOXES", SimpleNamespace(address=lambda _: 64))
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    monkeypatch.setattr(cuda, "_plan", cuda._plan.__wrapped__)
+    monkeypatch.setattr(cuda, "_row_length", cuda._row_length.__wrapped__)
+    monkeypatch.setitem(RESULTS, "plan_render", {"splat_bytes": 640, "scratch_bytes": 128, "list_bytes": 256})
+    monkeypatch.setitem(RESULTS, "plan_sums", {"row_length": 9, "blend_bytes": 64, "score_bytes": 64})
+    monkeypatch.setitem(RESULTS, "render", {"complete": True, "used": 7, "pairs": 20, "kept_in": 1, "seen": 8})
+    return calls
+
+
+def view_of(flags: int = 4, **more: Any) -> Any:
+    from sw_rasterizers.call import Call, Flag
+
+    camera = [1.0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 2, 30, 30, 16, 12, 0.2, 100]
+    return Call(camera, 32, 24, 1, 1.0, 0.3, Flag(flags), **more)
+
+
+def tensors_of(n: int = 8, columns: int = 3) -> dict[str, Any]:
+    shapes = {"means": (n, 3), "opacities": (n,), "scales": (n, columns), "quats": (n, 4), "sh_dc": (n, 1, 3),
+              "sh_rest": (n, 3, 3)}  # fmt: skip
+    return {name: rand(*shape, grad=True) for name, shape in shapes.items()}
+
+
+def test_pictures(drawn):
+    from splatwizard_core.api import GradBuffer
+    from sw_rasterizers import ops
+
+    call, tensors = view_of(background=rand(3), grad2d=GradBuffer(), flags=4 | 512), tensors_of()
+    update = AdamUpdate(tensors["sh_rest"], *(rand(8, 3, 3) for _ in range(3)), 0.1, 0.9, 0.99, 1e-8, 2)
+    offer_update(tensors["sh_rest"], update)
+    image, radii, alpha, median = ops.rasterize(call, tensors)
+    assert (image.shape, radii.shape, alpha.shape, median) == ((3, 24, 32), (8,), (1, 24, 32), None)
+    assert call.counts == [8, 20, 0, 0, 0]
+    version = tensors["sh_rest"]._version
+    grads = torch.autograd.grad(
+        (image, alpha), [*tensors.values()], [torch.ones_like(image), torch.ones_like(alpha)], allow_unused=True
+    )
+    shapes = [None if grad is None else grad.shape for grad in grads]
+    assert shapes == [*(x.shape for x in list(tensors.values())[:5]), None]
+    assert tensors["sh_rest"]._version > version
+    (plan,), (render,), (blend,), (project,) = (
+        drawn[name] for name in ("plan_render", "render", "blend_backward", "project_backward")
+    )
+    assert (render.count, render.shapes, render.rest_rows, render.color_channels, render.channels) == (8, 8, 3, 3, 3)
+    assert (render.splat_bytes, render.list_bytes, render.mailbox, render.flags & 1024) == (640, 256, 64, 1024)
+    assert (plan.room, plan.splat_room) == (render.room, render.splat_room)
+    assert (blend.pair_splats, blend.lists, blend.used, blend.pairs) == (render.second, render.lists, 7, 20)
+    assert (blend.color_channels, blend.count, blend.row_length, blend.by_median) == (3, 8, 9, None)
+    assert (project.rows, project.drawn, project.maps) == (blend.rows, render.drawn, False)
+    assert (project.rest_exp_avg, project.of_sh_rest, project.dc_exp_avg) == (update.exp_avg.data_ptr(), None, None)
+    assert list(project.rest_rates)[:4] == pytest.approx([0.1 / (1 - 0.9**2), 0.1, 0.99, 0.01])
+    assert call.grad2d.value.shape == (8, 2)
+
+    with torch.no_grad():
+        image, *_ = ops.rasterize(view_of(flags=4 | 8192 | 32768), tensors)
+    assert (image.dtype, drawn["render"][1].levels) == (torch.uint8, image.data_ptr())
+    assert (drawn["render"][1].drawn, drawn["render"][1].image) == (None, None)
+
+
+def test_a_whole_step(drawn, monkeypatch):
+    from sw_gaussians.config import GaussianTraining
+    from sw_gaussians.stage import ThreeDGSStage
+
+    from splatwizard_core.api import Camera, GaussianModel
+    from splatwizard_native.fused import photometric
+    from sw_rasterizers.standard import StandardRasterizer
+
+    monkeypatch.setattr(photometric, "_one", lambda device: torch.ones(()))
+    monkeypatch.setattr(torch, "zeros", lambda n, dtype, device: rand(n))
+    inputs = tensors_of()
+    raw = {"opacity_logits": inputs.pop("opacities"), "log_scales": inputs.pop("scales"), **inputs}
+    model = GaussianModel.from_tensors(**raw)
+    camera = Camera(32, 24, 30.0, 30.0, 16.0, 12.0, torch.eye(3), torch.ones(3))
+    view: Any = SimpleNamespace(image=lambda background, device: rand(3, 24, 32))
+    state: Any = SimpleNamespace(model=model, rasterizer=StandardRasterizer(), step=1)
+    result, loss = ThreeDGSStage(GaussianTraining()).whole_step(state, view, camera, rand(3))
+    (render,), (first,), (slope,) = (
+        drawn[name] for name in ("render", "photometric_loss", "photometric_loss_backward")
+    )
+    (blend,), (project,), (back,) = (
+        drawn[name] for name in ("blend_backward", "project_backward", "activate_backward")
+    )
+    assert (render.image, render.radii) == (first.x, result.radii.data_ptr())
+    assert (render.image, loss.total.data_ptr()) == (result.image.data_ptr(), first.total)
+    assert (slope.slopes, slope.grad) == (first.slopes, blend.by_image)
+    assert (blend.rows, project.of_scales, project.of_opacities) == (project.rows, back.by_scales, back.by_opacities)
+    assert (back.scales, back.opacities) == (render.scales, render.opacities)
+    assert result.grad2d.value.data_ptr() == project.of_grad2d
+    assert {name: p.grad.data_ptr() for name, p in model.named_parameters()} == {
+        "means": project.of_means, "quats": project.of_quats, "sh_dc": project.of_sh_dc, "sh_rest": project.of_sh_rest,
+        "log_scales": back.by_log_scales, "opacity_logits": back.by_logits,
+    }  # fmt: skip
+
+
+def test_a_picture_without_room_is_gone_on_with_and_one_of_too_many_pairs_refused(drawn, monkeypatch):
+    from sw_rasterizers import cuda, ops
+
+    monkeypatch.setattr(cuda._Recent, "pairs", 0)
+    monkeypatch.setitem(RESULTS, "render", {"used": 7, "pairs": 5000})
+    asked = []
+    whole = cuda_face().render
+
+    def render(**given):
+        asked.append((given["room"] if "room" in given else given["first"].numel(), given["projected"]))
+        found = whole(**given)
+        found.complete = len(asked) > 1
+        return found
+
+    monkeypatch.setattr(cuda_face(), "render", render)
+    tensors = tensors_of()
+    with torch.no_grad():
+        ops.rasterize(view_of(), tensors)
+        assert asked[0] == (1024, False)
+        assert asked[1][0] >= 5000
+        assert asked[1][1]
+        assert drawn["render"][0].splats == drawn["render"][1].splats
+        monkeypatch.setenv(cuda.LIMIT, "4999")
+        with pytest.raises(RuntimeError, match=r"^sw_rasterizers: 5000 splat-tile pairs are more than 4999: "):
+            ops.rasterize(view_of(), tensors)
+
+
+def cuda_face():
+    from sw_rasterizers import cuda_face
+
+    return cuda_face
+
+
+def test_surfels(drawn):
+    from sw_rasterizers.call import Flag
+    from sw_rasterizers.surfel import _draw
+
+    call, tensors = view_of(flags=4 | 512 | int(Flag.WITH_MAPS)), tensors_of(columns=2)
+    image, _, _, maps = _draw(call, tensors)
+    assert (image.shape, maps.shape) == ((3, 24, 32), (7, 24, 32))
+    grads = torch.autograd.grad((image, maps), list(tensors.values()), [torch.ones_like(image), torch.ones_like(maps)])
+    assert [grad.shape for grad in grads] == [x.shape for x in tensors.values()]
+    assert drawn["render"][0].scale_columns == 2
+    assert (drawn["project_backward"][0].maps, drawn["plan_sums"][0].maps) == (True, True)
+    assert drawn["blend_backward"][0].by_alpha is None
+
+
+@pytest.mark.parametrize("ordered", [0, 131072])
+def test_scores(drawn, ordered):
+    from splatwizard_core.api import RasterOptions, ScoreSpec
+    from sw_rasterizers.scoring import _add_on_cuda
+
+    tensors = {name: x.detach() for name, x in tensors_of().items()}
+    weight = rand(24, 32)
+    opt = RasterOptions(scores=(ScoreSpec("h", "hits"), ScoreSpec("g", "blend", pixel_weight=weight)), fisher=True)
+    totals = SimpleNamespace(scores=rand(2, 8).double(), fisher=rand(8, 21).double())
+    _add_on_cuda(
+        {name: tensors.get(name) for name in (*tensors, "cov3d", "sh", "colors")},
+        view_of(4 | ordered),
+        opt.scores,
+        totals,
+    )
+    (scores,), (fisher,), (render,) = (drawn[name] for name in ("accumulate_scores", "accumulate_fisher", "render"))
+    assert (scores.scores, list(scores.kinds[:2]), scores.weights[1]) == (2, [0, 3], weight.data_ptr())
+    assert (scores.weights[0], scores.totals[1]) == (None, totals.scores[1].data_ptr())
+    assert (fisher.splats, fisher.drawn, fisher.used, fisher.count) == (7, render.drawn, 7, 8)
+    assert (scores.scratch is not None) == bool(ordered)
+    assert render.flags == 4 | ordered | 1024 | 65536
+
+
+def test_shared_colours_and_radii(drawn):
+    from splatwizard_core.api import SH
+    from sw_rasterizers import ops
+    from sw_rasterizers.shared_colors import shared_colors
+
+    sh = SH(dc=rand(300, 1, 3, grad=True), codebook=rand(5, 3, 3, grad=True), active_degree=1)
+    segments = SimpleNamespace(
+        indices=torch.zeros(300, dtype=torch.int64), order=torch.arange(300), offsets=torch.zeros(6, dtype=torch.int64)
+    )
+    means = rand(300, 3, grad=True)
+    colors = shared_colors(sh, segments, means, rand(3), clamp=True)
+    grads = torch.autograd.grad(colors, (sh.codebook, sh.dc, means), torch.ones_like(colors))
+    assert [grad.shape for grad in grads] == [(5, 3, 3), (300, 1, 3), (300, 3)]
+    (back,), (shade,) = drawn["shade_shared_backward"], drawn["shade_shared"]
+    assert shade.rows == back.rows
+    assert (back.count, back.entries, back.coefficients, back.runs, back.clamp) == (300, 5, 3, 3, 1)
+    camera = SimpleNamespace(pose=[0.0] * 12, fx=1, fy=1, cx=0, cy=0, near=0.1, far=9, width=4, height=3)
+    assert ops.visible_radii(rand(8, 3), rand(8, 3), rand(8, 4), None, None, camera).shape == (8,)
+    assert drawn["visible_radii"][0].scale_columns == 3
 
 
 def test_wisp(calls, monkeypatch):

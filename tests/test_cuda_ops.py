@@ -20,8 +20,6 @@ MODULES = [module.cuda for module in DECLARED if module.cuda is not None]
 DEFINED = re.compile(r'm\.def\(\s*((?:"[^"]*"\s*)+)(,?)')
 OF_NAMESPACE = re.compile(r"TORCH_LIBRARY(?:_FRAGMENT|_IMPL)?\((\w+)")
 SOURCES = ("plugins/*/src/**/*.py", "plugins/*/tests/**/*.py", "splatwizard-*/**/*.py", "benchmarks/*.py", "tests/*.py")
-WRAPPERS = {"cuda_ops": "sw_rasterizers"}
-"""Python functions that load a module and return its namespace."""
 
 
 def included(path: Path) -> set[Path]:
@@ -64,11 +62,11 @@ NAMESPACES = {name.partition(".")[0] for name in OPS}
 
 
 def op_of(node: ast.AST) -> str | None:
-    """The namespace.name that an expression stands for: `torch.ops.x.y` or `cuda_ops().y`."""
+    """The namespace.name that an expression stands for: `torch.ops.x.y`."""
     if not isinstance(node, ast.Attribute):
         return None
     of = ast.unparse(node.value)
-    namespace = WRAPPERS.get(of.removesuffix("()")) if of.endswith("()") else of.removeprefix("torch.ops.")
+    namespace = of.removeprefix("torch.ops.")
     return f"{namespace}.{node.attr}" if namespace in NAMESPACES and of not in NAMESPACES else None
 
 
@@ -77,7 +75,7 @@ def test_calls_fit_the_definitions():
     used = set()
     for path in [path for pattern in SOURCES for path in ROOT.glob(pattern)]:
         text = path.read_text("utf-8")
-        if not any(each in text for each in ("torch.ops.", *WRAPPERS)):
+        if "torch.ops." not in text:
             continue
         for node in ast.walk(ast.parse(text)):
             if (name := op_of(node)) is not None:

@@ -9,6 +9,7 @@ from splatwizard_native.errors import NativeBuildError as NativeBuildError
 from splatwizard_native.errors import shortened as shortened
 from splatwizard_native.face_operations import operations as operations
 from splatwizard_native.fused.activations import activated as activated
+from splatwizard_native.fused.activations import activation_gradients as activation_gradients
 from splatwizard_native.fused.adam import AdamUpdate as AdamUpdate
 from splatwizard_native.fused.adam import adam_steps as adam_steps
 from splatwizard_native.fused.in_backward import end_offer as end_offer
@@ -16,6 +17,7 @@ from splatwizard_native.fused.in_backward import offer_update as offer_update
 from splatwizard_native.fused.in_backward import offered_update as offered_update
 from splatwizard_native.fused.photometric import Padding as Padding
 from splatwizard_native.fused.photometric import photometric as photometric
+from splatwizard_native.fused.photometric import photometric_gradient as photometric_gradient
 from splatwizard_native.fused.photometric import ssim_map as ssim_map
 from splatwizard_native.lazy_imports import lazy_exports as lazy_exports
 from splatwizard_native.lock import HeldError as HeldError

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from splatwizard_core.api import (
     ConfigError,
+    DensityControl,
     GaussianModel,
     LossPack,
     ParamGroup,
@@ -21,6 +22,7 @@ from sw_gaussians.adam_moments import keep_moments
 from sw_gaussians.averaging import average_of_the_end
 from sw_gaussians.control_tasks import control_task
 from sw_gaussians.fast.fused_adam import FusingOptimizer, offer_updates
+from sw_gaussians.fast.whole_step import WholeStep
 from sw_gaussians.late_batches import LAST_PRIORITY, SumViews
 from sw_gaussians.learning_rate import exponential_lr
 from sw_gaussians.pictures import PictureSizes, Rounds
@@ -33,8 +35,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from splatwizard_core.api import (
+        Camera,
         CameraSampler,
-        DensityControl,
         OptimizationParams,
         PipelineParams,
         RenderResult,
@@ -131,6 +133,7 @@ class ThreeDGSStage(Stage):
         self._needs: frozenset[str] = frozenset()  # of these options
         self._optimizer: SplatOptimizer | None = None
         self._post: Scheduler | None = None
+        self._whole = WholeStep()
 
     def steps(self, steps: int) -> int:
         """Scale a step count of the full schedule to this, possibly shortened, run."""
@@ -230,6 +233,12 @@ class ThreeDGSStage(Stage):
             self._options = RasterOptions(background=background, **asked)
             self._needs = needs
         return self._options
+
+    def whole_step(
+        self, state: TrainingState, view: View, camera: Camera, background: Tensor
+    ) -> tuple[RenderResult, LossPack] | None:
+        plain = type(self) is ThreeDGSStage and type(self.control).regularised is DensityControl.regularised
+        return self._whole(self, state, view, camera, background) if plain else None
 
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
         truth, settings = view.image(background, result.image.device), self.config.loss

@@ -96,7 +96,8 @@ def draw(picture: Picture, tensors: Tensors) -> Drawn:
     room = min(most, _rounded(max(_Recent.pairs, 1)))
     real, byte = means.new_empty, functools.partial(means.new_empty, dtype=torch.uint8)
     shape, plane = (picture.channels, *picture.size), (1, *picture.size)
-    image = byte(shape) if flags & BYTES else real(shape)
+    as_bytes = bool(flags & BYTES)
+    image = byte(shape) if as_bytes else real(shape)
     alpha = real(plane) if flags & ALPHA_MAP else None
     median = real(plane) if flags & MEDIAN_DEPTH else None
     maps = real((7, *picture.size)) if flags & WITH_MAPS else None
@@ -108,14 +109,17 @@ def draw(picture: Picture, tensors: Tensors) -> Drawn:
         projected = splats is not None
         splats = byte(sizes.splat_bytes) if splats is None else splats
         lists = byte(sizes.list_bytes)
+        scratch = byte(sizes.scratch_bytes)
         pair_splats = means.new_empty(room, dtype=torch.int32), means.new_empty(room, dtype=torch.int32)
+        # What is made here fits: addresses spare its checks, each as long as making it.
         found = cuda_face.render(
             **tensors, geom_indices=call.geom_indices, visible=call.visible, count=count, projected=projected,
-            mailbox=_MAILBOXES.address(device), splats=splats,
-            scratch=byte(sizes.scratch_bytes), lists=lists, first=pair_splats[0], second=pair_splats[1],
-            splat_room=splat_room, radii=radii, drawn=drawn, image=None if flags & BYTES else image,
-            levels=image if flags & BYTES else None, alpha=alpha, median=median, maps=maps, device=device,
-            **picture.view, **picture.how, **picture.canvas,
+            mailbox=_MAILBOXES.address(device), splats=splats.data_ptr(), splat_bytes=splats.numel(),
+            scratch=scratch.data_ptr(), scratch_bytes=scratch.numel(), lists=lists.data_ptr(),
+            list_bytes=lists.numel(), first=pair_splats[0].data_ptr(), second=pair_splats[1].data_ptr(), room=room,
+            splat_room=splat_room, radii=radii.data_ptr(), drawn=_at(drawn), image=_at(None if as_bytes else image),
+            levels=_at(image if as_bytes else None), alpha=_at(alpha), median=_at(median), maps=_at(maps),
+            device=device, **picture.view, **picture.how, **picture.canvas,
         )  # fmt: skip
         seconds += found.project_seconds
         if found.pairs > most:
@@ -191,8 +195,8 @@ def project_backward(
     made |= {name: means.new_empty(len(means), 2) for name in ("grad2d", "absgrad2d") if name in wanted}
     found = cuda_face.project_backward(
         **tensors, geom_indices=call.geom_indices, visible=call.visible, color_channels=picture.colors, drawn=drawn,
-        rows=rows, maps=maps, **{f"of_{name}": x for name, x in made.items()}, **_adam("dc", done.get("sh_dc")),
-        **_adam("rest", done.get("sh_rest")), **picture.view, **picture.how,
+        rows=rows, maps=maps, **{f"of_{name}": x.data_ptr() for name, x in made.items()},
+        **_adam("dc", done.get("sh_dc")), **_adam("rest", done.get("sh_rest")), **picture.view, **picture.how,
     )  # fmt: skip
     # Whoever offered an update sees by the version that it is done.
     torch.autograd.graph.increment_version([u.param for u in done.values()])
@@ -224,6 +228,11 @@ def visible_radii(call: Call, geometry: Tensors) -> Tensor:
         eps2d=call.eps2d,
     )  # fmt: skip
     return radii
+
+
+def _at(tensor: Tensor | None) -> int | None:
+    """Return the address of memory that was made to fit."""
+    return None if tensor is None else tensor.data_ptr()
 
 
 def _adam(name: str, u: AdamUpdate | None) -> dict[str, Any]:

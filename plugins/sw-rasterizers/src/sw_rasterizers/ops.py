@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -13,6 +13,8 @@ from splatwizard_native import AdamUpdate, offered_update
 from sw_rasterizers import cpu, cuda
 from sw_rasterizers.call import INPUTS, Call, Flag, camera_numbers
 
+Drawing = tuple[Tensor, Tensor, "Tensor | None", "Tensor | None"]
+Gradients = Callable[[Tensor], dict[str, Tensor]]
 UPDATED = ("sh_dc", "sh_rest")
 """Inputs for which the backward pass on CUDA can do Adam's step (`splatwizard_native.offer_update`)."""
 
@@ -56,79 +58,60 @@ class _Rasterize(torch.autograd.Function):
         return None, None, *map(found.get, INPUTS)
 
 
-@dataclass
-class _Drawing:
-    """A drawing on CUDA on its way from one node of autograd to the other.
+class _RasterizeOnCuda(torch.autograd.Function):
+    """On CUDA: (picture, updates, dummy, *INPUTS) -> as `_Rasterize`; `updates` are for the backward pass to do.
 
-    updates     of sh_dc and sh_rest, which the backward pass does where it finds their gradients
-    """
-
-    picture: cpu.Picture
-    updates: dict[str, AdamUpdate]
-    drawn: cuda.Drawn | None = None
-
-
-class _Project(torch.autograd.Function):
-    """First node on CUDA: a stand-in [N, sums of a Gaussian] without memory, whose gradient is what `_Blend` sums up.
-
-    Two nodes, so that the lists are free again before there is room for the gradients of the inputs. All large state
-    goes through save_for_backward, so that it is freed with the graph even if the result lives on.
+    Inputs go through save_for_backward, so that they are freed with the graph even if the result lives on. The lists
+    are gone sooner, before there is room for the gradients of the inputs.
     """
 
     @staticmethod
-    def forward(ctx: Any, drawing: _Drawing, dummy: Tensor | None, *inputs: Tensor | None) -> Tensor:
-        tensors = [None if x is None else x.detach().contiguous() for x in inputs]
-        drawing.drawn = drawn = cuda.draw(drawing.picture, dict(zip(INPUTS, tensors, strict=True)))
+    def forward(
+        ctx: Any, picture: cpu.Picture, updates: dict[str, AdamUpdate], dummy: Tensor | None, *inputs: Tensor | None
+    ) -> tuple[Tensor | None, ...]:
+        tensors = [None if x is None else x.contiguous() for x in inputs]
+        drawn = cuda.draw(picture, dict(zip(INPUTS, tensors, strict=True)))
         assert drawn.kept is not None
-        ctx.drawing = drawing
-        ctx.save_for_backward(*tensors, drawn.kept.drawn)
-        radii = drawn.radii
-        length = cuda.row_length(drawing.picture, radii.get_device())
-        return radii.new_empty_strided((len(radii), length), (0, 0), dtype=torch.float32)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, rows: Tensor) -> tuple[Tensor | None, ...]:
-        *stored, drawn = ctx.saved_tensors
-        drawing: _Drawing = ctx.drawing
-        call = drawing.picture.call
-        statistics = {"grad2d": call.grad2d, "absgrad2d": call.absgrad2d}
-        wanted = {name for name, asked in zip(INPUTS, ctx.needs_input_grad[2:], strict=True) if asked}
-        wanted |= {name for name, buffer in statistics.items() if buffer is not None}
-        tensors = dict(zip(INPUTS, stored, strict=True))
-        found = cuda.project_backward(drawing.picture, tensors, drawn, rows.contiguous(), wanted, drawing.updates)
-        drawing.updates = {}
-        for name, buffer in statistics.items():
-            if buffer is not None:
-                buffer.set(found[name])
-        return None, None, *map(found.get, INPUTS)
-
-
-class _Blend(torch.autograd.Function):
-    """Second node on CUDA: image [C,H,W], radii [N] int32, alpha and median depth [1,H,W] or None."""
-
-    @staticmethod
-    def forward(ctx: Any, drawing: _Drawing, stand_in: Tensor) -> tuple[Tensor | None, ...]:
-        drawn = drawing.drawn
-        assert drawn is not None
-        assert drawn.kept is not None
-        ctx.drawing, drawing.drawn = drawing, None
-        ctx.count, ctx.sizes = len(stand_in), drawn.kept.sizes
+        ctx.picture, ctx.updates, ctx.kept = picture, updates, [drawn.kept]
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(drawn.radii)
-        ctx.save_for_backward(drawn.kept.lists, drawn.kept.pair_splats)
+        ctx.save_for_backward(*tensors)
         return drawn.image, drawn.radii, drawn.alpha, drawn.median
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         image, _, alpha, median = (None if x is None else x.contiguous() for x in grads)
-        lists, pair_splats = ctx.saved_tensors
-        picture: cpu.Picture = ctx.drawing.picture
+        picture, updates = ctx.picture, ctx.updates
+        tensors = dict(zip(INPUTS, ctx.saved_tensors, strict=True))
         if image is None:
-            image = lists.new_zeros((picture.channels, *picture.size), dtype=torch.float32)
-        kept = cuda.Kept(lists, pair_splats, lists, ctx.sizes)
-        return None, cuda.blend_backward(picture, ctx.count, kept, {"image": image, "alpha": alpha, "median": median})
+            image = tensors["means"].new_zeros(picture.channels, *picture.size)
+        wanted = {name for name, asked in zip(INPUTS, ctx.needs_input_grad[3:], strict=True) if asked}
+        kept = ctx.kept if _KEEPS_GRAPH() else [ctx.kept.pop()]
+        ctx.updates = {}
+        by = {"image": image, "alpha": alpha, "median": median}
+        found = _gradients_on_cuda(picture, tensors, [*kept], by, wanted, updates)
+        return None, None, None, *map(found.get, INPUTS)
+
+
+_KEEPS_GRAPH: Callable[[], bool] = getattr(torch._C._autograd, "_get_current_graph_task_keep_graph", lambda: True)
+"""Whether a backward pass under way may be followed by another one through the same nodes."""
+
+
+def _gradients_on_cuda(
+    picture: cpu.Picture, tensors: cpu.Tensors, kept: list[Any], by: cpu.Tensors, wanted: set[str],
+    updates: dict[str, AdamUpdate],
+) -> dict[str, Tensor]:  # fmt: skip
+    """Return the gradients that are wanted, and fill the statistics of the call; `kept` is empty thereafter."""
+    call, shown, means = picture.call, kept[0].drawn, tensors["means"]
+    statistics = {"grad2d": call.grad2d, "absgrad2d": call.absgrad2d}
+    wanted = wanted | {name for name, buffer in statistics.items() if buffer is not None}
+    rows = cuda.blend_backward(picture, len(means), kept.pop(), by)
+    found = cuda.project_backward(picture, tensors, shown, rows, wanted, updates)
+    for name, buffer in statistics.items():
+        if buffer is not None:
+            buffer.set(found[name])
+    return found
 
 
 def _updates(tensors: dict[str, Tensor | None]) -> dict[str, AdamUpdate]:
@@ -159,9 +142,38 @@ def rasterize(call: Call, tensors: dict[str, Tensor | None]) -> tuple[Tensor, Te
     dummy = None if differentiable else torch.empty(0, requires_grad=True)
     if means.is_cuda:
         named = dict(zip(INPUTS, inputs, strict=True))
-        drawing = _Drawing(cpu.Picture(call, named, int(call.flags)), _updates(named))
-        return _Blend.apply(drawing, _Project.apply(drawing, dummy, *inputs))  # type: ignore[no-any-return]
+        picture = cpu.Picture(call, named, int(call.flags))
+        return _RasterizeOnCuda.apply(picture, _updates(named), dummy, *inputs)  # type: ignore[no-any-return]
     return _Rasterize.apply(call, dummy, *inputs)  # type: ignore[no-any-return]
+
+
+def draw_unrecorded(call: Call, tensors: dict[str, Tensor | None]) -> tuple[Drawing, Gradients]:
+    """Draw one view as `rasterize` does, unknown to autograd; the second gives gradients, once, by names of INPUTS.
+
+    Of all inputs, from the gradient of the image. It fills the statistics of the call.
+    """
+    call.flags |= Flag.SAVE
+    named = {name: None if (x := tensors.get(name)) is None else x.contiguous() for name in INPUTS}
+    means = named["means"]
+    assert means is not None
+    picture = cpu.Picture(call, named, int(call.flags))
+    updates = _updates(tensors) if means.is_cuda else {}
+    drawn: Any = cuda.draw(picture, named) if means.is_cuda else cpu.draw(picture, named)
+    kept = [drawn.kept]  # gone before there is room for the gradients of the inputs
+    wanted = {name for name, x in named.items() if x is not None}
+    buffers = {"grad2d": call.grad2d, "absgrad2d": call.absgrad2d}
+    statistics = {name: buffer for name, buffer in buffers.items() if buffer is not None}
+
+    def gradients(by_image: Tensor) -> dict[str, Tensor]:
+        by = {"image": by_image, "alpha": None, "median": None}
+        if means.is_cuda:
+            return _gradients_on_cuda(picture, named, kept, by, wanted, updates)
+        found = cpu.draw_backward(picture, named, kept.pop(), by, wanted | statistics.keys())
+        for name, buffer in statistics.items():
+            buffer.set(found[name])
+        return found
+
+    return drawn[:4], gradients
 
 
 def visible_radii(

@@ -24,7 +24,7 @@ from splatwizard_core.api import (
 )
 from sw_rasterizers import plugin
 from sw_rasterizers.call import Call, Flag, camera_numbers
-from sw_rasterizers.ops import rasterize, visible_radii
+from sw_rasterizers.ops import Gradients, draw_unrecorded, rasterize, visible_radii
 from sw_rasterizers.scoring import Totals, add_scores, check_count
 
 CUDA_CHANNELS = 8
@@ -55,63 +55,30 @@ class StandardRasterizer:
             found = self.accumulate(g, [cam], opt)
             result = self.render(g, cam, replace(opt, scores=(), fisher=False))
             return replace(result, scores=found.scores, fisher=found.fisher)
-        call = self._call(g, cam, opt)
+        call = self._call(g, cam, opt, learns=torch.is_grad_enabled())
+        self._check(g, opt, call)
+        return _result(g, cam, opt, call, *rasterize(call, _tensors(g)))
+
+    def draw(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> tuple[RenderResult, Gradients]:
+        """Draw one view as `render` does, unknown to autograd; the result, and what gives its gradients.
+
+        Those of all inputs from that of the image [C,H,W], once, by the names of `call.INPUTS`; it fills the statistics
+        that were asked for. An input with an offered update (`splatwizard_native.offer_update`) that is done then has
+        none. Raises as `render`; ConfigError for scores.
+        """
+        self.info.check_request(g, opt)
+        if opt.scores or opt.fisher:
+            raise ConfigError("scores are no part of a drawing to be learned from: ask `accumulate` for them")
+        call, tensors = self._call(g, cam, opt, learns=True), _tensors(g)
+        self._check(g, opt, call)
+        drawn, gradients = draw_unrecorded(call, tensors)
+        return _result(g, cam, opt, call, *drawn), gradients
+
+    def _check(self, g: GaussianInputs, opt: RasterOptions, call: Call) -> None:
         if g.colors is not None and g.colors.shape[1] == 0 and g.features is None and not opt.depth:
             raise ShapeError("GaussianInputs.colors has no channel: there is nothing to draw")
         if (opt.absgrad or opt.fragment_grad) and g.means.is_cuda:
             _check_absgrad(g, call.flags)
-        sh = g.sh
-        image, radii, alpha, median = rasterize(
-            call,
-            {
-                "means": g.means,
-                "opacities": g.opacities,
-                "scales": g.scales,
-                "quats": g.quats,
-                "cov3d": g.cov3d,
-                "sh": None if sh is None else sh.dense,
-                "sh_dc": None if sh is None else sh.dc,
-                "sh_rest": None if sh is None else sh.rest,
-                "colors": g.colors,
-                "features": g.features,
-                "scale_factors": g.scale_factors,
-            },
-        )
-        colors = 3 if g.colors is None else g.colors.shape[1]
-        at = colors
-        depth = {}
-        if Flag.INVERSE_DEPTH in call.flags:
-            depth["inverse"] = image[at : at + 1]
-            at += 1
-        if Flag.ACCUMULATED_DEPTH in call.flags:
-            depth["accumulated"] = image[at : at + 1]
-            at += 1
-        if "expected" in opt.depth:
-            assert alpha is not None
-            depth["expected"] = depth["accumulated"] / alpha.clamp(min=1e-10)
-        if median is not None and "median" in opt.depth:
-            depth["median"] = median
-        visible, pairs, evaluated, blended, invalid = call.counts
-        return RenderResult(
-            image=image[:colors] if image.shape[0] > colors else image,
-            radii=radii,
-            inputs=g,
-            alpha=alpha if opt.alpha else None,
-            depth={name: depth[name] for name in sorted(opt.depth)},
-            features=None if g.features is None else image[at:],
-            grad2d=call.grad2d,
-            absgrad2d=call.absgrad2d if opt.absgrad else None,
-            fragment_grad=call.absgrad2d if opt.fragment_grad else None,
-            stats=RasterStats(
-                n_visible=visible,
-                n_pairs=pairs,
-                n_evaluated=evaluated if evaluated >= 0 else None,
-                n_blended=blended if blended >= 0 else None,
-                n_pixels=cam.width * cam.height,
-                n_invalid=invalid,
-                stage_seconds=call.seconds,
-            ),
-        )
 
     @torch.no_grad()
     def visible_filter(self, g: GaussianInputs, cam: Camera) -> Tensor:
@@ -134,16 +101,15 @@ class StandardRasterizer:
         for cam in cams:
             opt.check_scores(cam)
             if opt.scores or opt.fisher:
-                add_scores(g, self._call(g, cam, plain), opt, totals)
+                add_scores(g, self._call(g, cam, plain, learns=False), opt, totals)
         return totals.result()
 
-    def _call(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> Call:
+    def _call(self, g: GaussianInputs, cam: Camera, opt: RasterOptions, *, learns: bool) -> Call:
         flags = _flags(
             opt.profile, opt.clamp_grad, frozenset(opt.depth), opt.antialias, opt.clamp_color,
             opt.features_detach_geometry, opt.absgrad, opt.fragment_grad, opt.alpha, self.count,
             torch.are_deterministic_algorithms_enabled(),
         )  # fmt: skip
-        watch = torch.is_grad_enabled()
         background = opt.background_of(3 if g.colors is None else g.colors.shape[1], cam, g.means)
         return Call(
             camera_numbers(cam),
@@ -156,9 +122,75 @@ class StandardRasterizer:
             geom_indices=None if g.geom_indices is None else g.geom_indices.contiguous(),
             visible=_as_bytes(g.visible),
             background=None if background is None else background.detach().contiguous(),
-            grad2d=GradBuffer() if watch and opt.grad2d else None,
-            absgrad2d=GradBuffer() if watch and (opt.absgrad or opt.fragment_grad) else None,
+            grad2d=GradBuffer() if learns and opt.grad2d else None,
+            absgrad2d=GradBuffer() if learns and (opt.absgrad or opt.fragment_grad) else None,
         )
+
+
+def _tensors(g: GaussianInputs) -> dict[str, Tensor | None]:
+    """Return the inputs by the names that the kernels have for them."""
+    sh = g.sh
+    return {
+        "means": g.means,
+        "opacities": g.opacities,
+        "scales": g.scales,
+        "quats": g.quats,
+        "cov3d": g.cov3d,
+        "sh": None if sh is None else sh.dense,
+        "sh_dc": None if sh is None else sh.dc,
+        "sh_rest": None if sh is None else sh.rest,
+        "colors": g.colors,
+        "features": g.features,
+        "scale_factors": g.scale_factors,
+    }
+
+
+def _result(
+    g: GaussianInputs,
+    cam: Camera,
+    opt: RasterOptions,
+    call: Call,
+    image: Tensor,
+    radii: Tensor,
+    alpha: Tensor | None,
+    median: Tensor | None,
+) -> RenderResult:
+    """Return the result of a drawing, its channels told apart."""
+    colors = 3 if g.colors is None else g.colors.shape[1]
+    at = colors
+    depth = {}
+    if Flag.INVERSE_DEPTH in call.flags:
+        depth["inverse"] = image[at : at + 1]
+        at += 1
+    if Flag.ACCUMULATED_DEPTH in call.flags:
+        depth["accumulated"] = image[at : at + 1]
+        at += 1
+    if "expected" in opt.depth:
+        assert alpha is not None
+        depth["expected"] = depth["accumulated"] / alpha.clamp(min=1e-10)
+    if median is not None and "median" in opt.depth:
+        depth["median"] = median
+    visible, pairs, evaluated, blended, invalid = call.counts
+    return RenderResult(
+        image=image[:colors] if image.shape[0] > colors else image,
+        radii=radii,
+        inputs=g,
+        alpha=alpha if opt.alpha else None,
+        depth={name: depth[name] for name in sorted(opt.depth)},
+        features=None if g.features is None else image[at:],
+        grad2d=call.grad2d,
+        absgrad2d=call.absgrad2d if opt.absgrad else None,
+        fragment_grad=call.absgrad2d if opt.fragment_grad else None,
+        stats=RasterStats(
+            n_visible=visible,
+            n_pairs=pairs,
+            n_evaluated=evaluated if evaluated >= 0 else None,
+            n_blended=blended if blended >= 0 else None,
+            n_pixels=cam.width * cam.height,
+            n_invalid=invalid,
+            stage_seconds=call.seconds,
+        ),
+    )
 
 
 def _check_absgrad(g: GaussianInputs, flags: Flag) -> None:

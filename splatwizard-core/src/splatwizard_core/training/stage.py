@@ -18,6 +18,7 @@ from splatwizard_core.training.params import OptimizationParams, PipelineParams
 from splatwizard_core.training.plan import When, scaled
 
 if TYPE_CHECKING:
+    from splatwizard_core.scene.camera import Camera
     from splatwizard_core.training.optimizer import SplatOptimizer
     from splatwizard_core.training.scheduler import Scheduler
     from splatwizard_core.training.state import TrainingState
@@ -184,6 +185,12 @@ class Stage:
     def running(self, state: TrainingState) -> AbstractContextManager[Any]:
         """Enclose the loop of steps, of a new state or a resumed one; what it does around them is not training time."""
         return nullcontext()
+
+    def whole_step(
+        self, state: TrainingState, view: View, camera: Camera, background: Tensor
+    ) -> tuple[RenderResult, LossPack] | None:
+        """Draw a view and find loss and gradients in one, as the parts of a step do, faster; None: the parts shall."""
+        return None
 
     def finish(self, model: SplatModel, scene: Scene) -> SplatModel:
         """Return the model that the next stage, or the encoder, gets; called once after the last step."""

@@ -107,18 +107,21 @@ class Trainer:
         if ppl.random_background or (self._has_alpha and stage.random_background(step)):
             background = torch.rand(3, generator=state.streams("background")).to(self.device, non_blocking=True)
         camera = self._camera(view)
-        inputs = model.gaussians(camera, state.rasterizer)
-        result = state.rasterizer.render(inputs, camera, stage.raster_options(step, background))
-        if ppl.clamp_render:
-            result.image = result.image.clamp(0, 1)
-        mark("render")
-
-        loss = stage.loss(model, view, result, background, step)
-        self._keep(loss)
-        mark("loss")
-        self._backward(loss.total)
-        mark("backward")
-
+        found = None if self.stage_clock or ppl.clamp_render else stage.whole_step(state, view, camera, background)
+        if found is None:
+            inputs = model.gaussians(camera, state.rasterizer)
+            result = state.rasterizer.render(inputs, camera, stage.raster_options(step, background))
+            if ppl.clamp_render:
+                result.image = result.image.clamp(0, 1)
+            mark("render")
+            loss = stage.loss(model, view, result, background, step)
+            self._keep(loss)
+            mark("loss")
+            self._backward(loss.total)
+            mark("backward")
+        else:
+            result, loss = found
+            self._keep(loss)
         state.result, state.loss = result, loss
         with torch.no_grad():
             stop = state.post.exec(step, state) or stop

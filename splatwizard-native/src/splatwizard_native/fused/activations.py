@@ -24,6 +24,24 @@ def activated(log_scales: Tensor, opacity_logits: Tensor) -> tuple[Tensor, Tenso
     return torch.exp(log_scales), torch.sigmoid(opacity_logits)
 
 
+def activation_gradients(
+    scales: Tensor, opacities: Tensor, by_scales: Tensor | None, by_opacities: Tensor | None
+) -> tuple[Tensor | None, Tensor | None]:
+    """Return the gradients by what `activated` was given, from its results and the gradients by these, contiguous."""
+    given = by_scales, by_opacities
+    if not (scales.is_cuda and scales.dtype == torch.float32 and TRAINING.has_cuda()):
+        sigmoid_backward = torch.ops.aten.sigmoid_backward
+        by_logits = None if by_opacities is None else sigmoid_backward(by_opacities, opacities)
+        return None if by_scales is None else by_scales * scales, by_logits
+    made = [None if g is None else torch.empty_like(g) for g in given]
+    cuda_face.activate_backward(
+        scales=scales, opacities=opacities, by_scales=by_scales, by_opacities=by_opacities, by_log_scales=made[0],
+        by_logits=made[1], scale_count=0 if by_scales is None else scales.numel(),
+        opacity_count=0 if by_opacities is None else opacities.numel(),
+    )  # fmt: skip
+    return made[0], made[1]
+
+
 class _Activate(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, log_scales: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
@@ -42,11 +60,4 @@ class _Activate(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         wanted = zip(grads, ctx.needs_input_grad, strict=True)
         given = [g.contiguous() if g is not None and asked else None for g, asked in wanted]
-        made = [None if g is None else torch.empty_like(g) for g in given]
-        scales, opacities = ctx.saved_tensors
-        cuda_face.activate_backward(
-            scales=scales, opacities=opacities, by_scales=given[0], by_opacities=given[1], by_log_scales=made[0],
-            by_logits=made[1], scale_count=0 if given[0] is None else scales.numel(),
-            opacity_count=0 if given[1] is None else opacities.numel(),
-        )  # fmt: skip
-        return made[0], made[1]
+        return activation_gradients(*ctx.saved_tensors, *given)

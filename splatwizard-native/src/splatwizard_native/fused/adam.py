@@ -54,17 +54,23 @@ def _fused(updates: Sequence[AdamUpdate], device: torch.device) -> list[AdamUpda
     """Do these updates, of tensors on a device with kernels, in one call; return those that they do not take."""
     operations: Any = cuda_face if device.type == "cuda" else face
     alignment, more = (16, {"device": device.index}) if device.type == "cuda" else (1, {})
+    index, real = -1 if device.index is None else device.index, torch.float32
     rows, held, left = [], [], []
     for u in updates:
-        tensors = u.param, u.grad.contiguous(), u.exp_avg, u.exp_avg_sq
-        addresses = [t.data_ptr() for t in tensors]
-        for t, at in zip(tensors, addresses, strict=True):
-            if t.dtype is not torch.float32 or t.device != device or at % alignment or not t.is_contiguous():
-                left.append(u)
-                break
-        else:
+        p, g, m, v = tensors = u.param, u.grad.contiguous(), u.exp_avg, u.exp_avg_sq
+        at = p.data_ptr(), g.data_ptr(), m.data_ptr(), v.data_ptr()
+        if (
+            p.dtype is g.dtype is m.dtype is v.dtype is real
+            and p.get_device() == g.get_device() == m.get_device() == v.get_device() == index
+            and p.is_contiguous()
+            and m.is_contiguous()
+            and v.is_contiguous()
+            and (at[0] | at[1] | at[2] | at[3]) % alignment == 0
+        ):
             held.append(tensors)  # alive until the call
-            rows.append((*addresses, u.param.numel(), u.lr, u.beta1, u.beta2, u.eps, u.step))
+            rows.append((*at, p.numel(), u.lr, u.beta1, u.beta2, u.eps, u.step))
+        else:
+            left.append(u)
     listed = operations.adam_update * len(rows)
     operations.adam(updates=listed(*rows), count=len(rows), **more)
     torch.autograd.graph.increment_version([tensors[0] for tensors in held])

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import torch
@@ -42,50 +42,75 @@ def photometric(
     return (1.0 - lambda_dssim) * l1 + lambda_dssim * (1.0 - similarity), l1.detach(), similarity.detach()
 
 
-class _Photometric(torch.autograd.Function):
-    """offset + l1_weight * L1 + ssim_weight * SSIM, and both means.
+def photometric_gradient(
+    image: Tensor, target: Tensor, lambda_dssim: float, padding: Padding = "same"
+) -> tuple[Tensor, Tensor, Tensor, Tensor] | None:
+    """Return what `photometric` does and the gradient by `image`, unknown to autograd; None: no kernel takes these."""
+    if _fused(image, target) is None:
+        return None
+    weights = {"valid": padding == "valid", "l1_weight": 1.0 - lambda_dssim, "ssim_weight": -lambda_dssim}
+    (total, l1, similarity), kept = _means(image, target, weights, lambda_dssim, learns=True)
+    return total, l1, similarity, _gradient(kept, weights, _one(image.device)).view(image.shape)
+
+
+def _means(
+    x: Tensor, y: Tensor, weights: dict[str, Any], offset: float, *, learns: bool
+) -> tuple[tuple[Tensor, ...], tuple[Any, ...]]:
+    """Return the total and both means, each a tensor of its own, and what `_gradient` needs.
 
     On the CPU the gradient is computed along with the value; on CUDA no number is waited for, and the gradient is put
     together when its scale is known.
     """
+    image, target = (t.reshape(-1, *t.shape[-2:]).contiguous() for t in (x, y))
+    planes, height, width = image.shape
+    if x.is_cuda:
+        total, l1, similarity = found = tuple(image.new_empty(()) for _ in range(3))
+        slopes = image.new_empty(3, *image.shape) if learns else None
+        cuda_face.photometric_loss(
+            x=image, y=target, **weights, offset=offset, total=total, l1=l1, ssim=similarity, slopes=slopes,
+            sums=image.new_empty(2 + 2 * planes * -(-height // TILE) * -(-width // TILE)),
+        )  # fmt: skip
+        return found, (image, target, slopes)
+    grad = torch.empty_like(image) if learns else None
+    row_sums = image.new_empty(2, planes, height, dtype=torch.float64)
+    told = face.photometric(x=image, y=target, **weights, grad=grad, row_sums=row_sums)
+    sums = offset + weights["l1_weight"] * told.l1 + weights["ssim_weight"] * told.ssim, told.l1, told.ssim
+    return tuple(map(x.new_tensor, sums)), (grad,)
+
+
+def _gradient(kept: Sequence[Tensor], weights: dict[str, Any], scale: Tensor) -> Tensor:
+    """Return `scale` times the gradient of the total by the image, [planes, H, W]."""
+    if scale.is_cuda:
+        x, y, slopes = kept
+        grad = torch.empty_like(x)
+        cuda_face.photometric_loss_backward(x=x, y=y, slopes=slopes, **weights, scale=scale, grad=grad)
+        return grad
+    grad = kept[0]
+    return grad if float(scale) == 1.0 else grad * scale  # nearly always the loss itself is differentiated
+
+
+@functools.cache
+def _one(device: torch.device) -> Tensor:
+    return torch.ones((), device=device)
+
+
+class _Photometric(torch.autograd.Function):
+    """offset + l1_weight * L1 + ssim_weight * SSIM, and both means."""
 
     @staticmethod
     def forward(
         ctx: Any, learns: bool, x: Tensor, y: Tensor, valid: bool, l1_weight: float, ssim_weight: float, offset: float
     ) -> tuple[Tensor, ...]:
-        image, target = (t.reshape(-1, *t.shape[-2:]).contiguous() for t in (x, y))
         ctx.weights, ctx.shape = {"valid": valid, "l1_weight": l1_weight, "ssim_weight": ssim_weight}, x.shape
-        planes, height, width = image.shape
-        if x.is_cuda:
-            # Each a tensor of its own: views of one could not be changed in place.
-            total, l1, similarity = found = tuple(image.new_empty(()) for _ in range(3))
-            slopes = image.new_empty(3, *image.shape) if learns else None
-            cuda_face.photometric_loss(
-                x=image, y=target, **ctx.weights, offset=offset, total=total, l1=l1, ssim=similarity, slopes=slopes,
-                sums=image.new_empty(2 + 2 * planes * -(-height // TILE) * -(-width // TILE)),
-            )  # fmt: skip
-            ctx.save_for_backward(image, target, slopes)
-        else:
-            grad = torch.empty_like(image) if learns else None
-            row_sums = image.new_empty(2, planes, height, dtype=torch.float64)
-            told = face.photometric(x=image, y=target, **ctx.weights, grad=grad, row_sums=row_sums)
-            sums = offset + l1_weight * told.l1 + ssim_weight * told.ssim, told.l1, told.ssim
-            found = tuple(map(x.new_tensor, sums))
-            ctx.save_for_backward(grad)
+        found, kept = _means(x, y, ctx.weights, offset, learns=learns)
+        ctx.save_for_backward(*kept)
         ctx.mark_non_differentiable(*found[1:])
         return found
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, scale: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
-        if scale.is_cuda:
-            x, y, slopes = ctx.saved_tensors
-            grad = torch.empty_like(x)
-            cuda_face.photometric_loss_backward(x=x, y=y, slopes=slopes, **ctx.weights, scale=scale, grad=grad)
-        else:
-            (grad,) = ctx.saved_tensors
-            grad = grad if float(scale) == 1.0 else grad * scale  # nearly always the loss itself is differentiated
-        return None, grad.view(ctx.shape), *[None] * 5
+        return None, _gradient(ctx.saved_tensors, ctx.weights, scale).view(ctx.shape), *[None] * 5
 
 
 def ssim_map(x: Tensor, y: Tensor, padding: Padding = "same") -> Tensor:
@@ -112,4 +137,4 @@ def _fused(x: Tensor, y: Tensor) -> Callable[..., tuple[Tensor, Tensor, Tensor]]
     if x.dtype != torch.float32 or y.requires_grad:
         return None
     fused = TRAINING.has_cuda() if x.is_cuda else x.device.type == "cpu" and TRAINING.try_load()
-    return partial(_Photometric.apply, torch.is_grad_enabled() and x.requires_grad) if fused else None
+    return functools.partial(_Photometric.apply, torch.is_grad_enabled() and x.requires_grad) if fused else None

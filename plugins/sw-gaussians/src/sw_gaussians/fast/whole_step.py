@@ -1,0 +1,115 @@
+"""Drawing, loss and gradients of a training step of plain 3DGS in one, outside of autograd.
+
+The kernels, and so the numbers, are those of `GaussianModel.gaussians`, `Rasterizer.render`, `ThreeDGSStage.loss` and
+autograd: what is spared is the time of the host, more than half a millisecond a step, which a GPU would wait for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any, Protocol, TypeGuard, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from splatwizard_core.api import SH, Feature, GaussianInputs, GaussianModel, LossPack, RasterOptions, RenderResult
+from splatwizard_native import activated, activation_gradients, photometric_gradient
+
+if TYPE_CHECKING:
+    from splatwizard_core.api import Camera, Rasterizer, SplatModel, TrainingState, View
+    from sw_gaussians.stage import ThreeDGSStage
+
+
+@runtime_checkable
+class Draws(Protocol):
+    """A rasterizer that draws unknown to autograd.
+
+    draw    the result, and what gives, once, from the gradient of the image those of means, opacities, scales, quats,
+            sh_dc and sh_rest, but for those whose offered update is done then
+    """
+
+    def draw(
+        self, g: GaussianInputs, cam: Camera, opt: RasterOptions
+    ) -> tuple[RenderResult, Callable[[Tensor], dict[str, Tensor]]]: ...
+
+
+@runtime_checkable
+class Chooses(Protocol):
+    """A rasterizer that delegates: `served` are the names of those that have drawn."""
+
+    served: set[str]
+
+    def decided(self, opt: RasterOptions) -> RasterOptions: ...
+
+    def select(self, required: Iterable[str]) -> Rasterizer: ...
+
+
+class WholeStep:
+    """Takes the whole step where everything is plain; remembers who draws with the options of the last step."""
+
+    def __init__(self) -> None:
+        self._asked: tuple[Rasterizer, RasterOptions] | None = None
+        self._found: tuple[Draws, RasterOptions] | None = None
+
+    def __call__(
+        self, stage: ThreeDGSStage, state: TrainingState, view: View, camera: Camera, background: Tensor
+    ) -> tuple[RenderResult, LossPack] | None:
+        """Do what `Stage.whole_step` says, or None."""
+        model = state.model
+        if not is_plain(model) or not torch.is_grad_enabled():
+            return None
+        params: dict[str, Any] = model._parameters
+        sh_rest, settings, truth = params["sh_rest"], stage.config.loss, view.image(background, params["means"].device)
+        if truth.shape != (3, camera.height, camera.width) or truth.dtype != torch.float32 or truth.requires_grad:
+            return None
+        sh = SH(dc=params["sh_dc"], rest=sh_rest if sh_rest.shape[1] else None, active_degree=model.active_sh_degree)
+        with torch.no_grad():
+            scales, opacities = activated(params["log_scales"], params["opacity_logits"])
+        g = GaussianInputs(params["means"], opacities, scales, params["quats"], sh=sh)
+        found = self._drawer(state.rasterizer, g, stage.raster_options(state.step, background))
+        if found is None:
+            return None
+        drawer, options = found
+        with torch.no_grad():
+            result, gradients = drawer.draw(g, camera, options)
+            loss = photometric_gradient(result.image, truth, settings.lambda_dssim, settings.ssim_padding)
+            if loss is None:
+                return None
+            total, l1, similarity, by_image = loss
+            by: dict[str, Tensor | None] = {**gradients(by_image)}
+            by["log_scales"], by["opacity_logits"] = activation_gradients(
+                scales, opacities, by["scales"], by["opacities"]
+            )
+        for name, param in params.items():
+            param.grad = by.get(name)
+        return result, LossPack(total, {"l1": l1, "ssim": similarity})
+
+    def _drawer(
+        self, rasterizer: Rasterizer, g: GaussianInputs, opt: RasterOptions
+    ) -> tuple[Draws, RasterOptions] | None:
+        """Return who draws, and with which options; only who has drawn before: `render` finds out who cannot."""
+        if self._found is not None and self._asked == (rasterizer, opt):
+            return self._found
+        self._asked, self._found, chosen = (rasterizer, opt), None, rasterizer
+        if isinstance(rasterizer, Chooses):
+            opt = rasterizer.decided(opt)
+            profile = {f"profile {opt.profile}"} if opt.profile else frozenset()
+            chosen = rasterizer.select(Feature.asked_by(opt, g).names | profile)
+            if chosen.info.name not in rasterizer.served:
+                return None
+        if isinstance(chosen, Draws):
+            self._found = chosen, opt
+        return self._found
+
+
+def is_plain(model: SplatModel) -> TypeGuard[GaussianModel]:
+    """Whether these are Gaussians of 3DGS with parameters that all learn, without gradient yet and without hooks."""
+    return type(model) is GaussianModel and all(
+        p is not None
+        and p.requires_grad
+        and p.grad is None
+        and p.dtype is torch.float32
+        and p.is_contiguous()
+        and not p._backward_hooks
+        for p in model._parameters.values()
+    )
