@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import dataclasses
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -218,23 +219,35 @@ def test_a_whole_step(drawn, monkeypatch):
     camera = Camera(32, 24, 30.0, 30.0, 16.0, 12.0, torch.eye(3), torch.ones(3))
     view: Any = SimpleNamespace(image=lambda background, device: rand(3, 24, 32))
     state: Any = SimpleNamespace(model=model, rasterizer=StandardRasterizer(), step=1)
-    result, loss = ThreeDGSStage(GaussianTraining()).whole_step(state, view, camera, rand(3))
-    (render,), (first,), (slope,) = (
-        drawn[name] for name in ("render", "photometric_loss", "photometric_loss_backward")
-    )
-    (blend,), (project,), (back,) = (
-        drawn[name] for name in ("blend_backward", "project_backward", "activate_backward")
-    )
-    assert (render.image, render.radii) == (first.x, result.radii.data_ptr())
-    assert (render.image, loss.total.data_ptr()) == (result.image.data_ptr(), first.total)
-    assert (slope.slopes, slope.grad) == (first.slopes, blend.by_image)
-    assert (blend.rows, project.of_scales, project.of_opacities) == (project.rows, back.by_scales, back.by_opacities)
-    assert (back.scales, back.opacities) == (render.scales, render.opacities)
-    assert result.grad2d.value.data_ptr() == project.of_grad2d
-    assert {name: p.grad.data_ptr() for name, p in model.named_parameters()} == {
-        "means": project.of_means, "quats": project.of_quats, "sh_dc": project.of_sh_dc, "sh_rest": project.of_sh_rest,
-        "log_scales": back.by_log_scales, "opacity_logits": back.by_logits,
-    }  # fmt: skip
+    stage, background = ThreeDGSStage(GaussianTraining()), rand(3)
+    for seed in range(3):  # the first is checked, the next are like it
+        camera = dataclasses.replace(camera, tau=torch.tensor([0.0, 0.0, seed]))
+        result, loss = stage.whole_step(state, view, camera, background)
+        render, blend, project, back, first, slope = (drawn[name][seed] for name in (
+            "render", "blend_backward", "project_backward", "activate_backward", "photometric_loss",
+            "photometric_loss_backward",
+        ))  # fmt: skip
+        assert render.camera[11] == blend.camera[11] == project.camera[11] == seed
+        assert (render.background, blend.background, render.count) == (background.data_ptr(), background.data_ptr(), 8)
+        assert (render.means, render.sh_rest) == (model.means.data_ptr(), model.sh_rest.data_ptr())
+        assert (project.means, project.scales, project.drawn) == (render.means, render.scales, render.drawn)
+        assert (blend.lists, blend.pair_splats, blend.used) == (render.lists, render.second, 7)
+        assert (render.image, render.radii) == (first.x, result.radii.data_ptr())
+        assert (render.image, loss.total.data_ptr()) == (result.image.data_ptr(), first.total)
+        assert (slope.slopes, slope.grad) == (first.slopes, blend.by_image)
+        assert (blend.rows, project.of_scales, project.of_opacities) == (
+            project.rows,
+            back.by_scales,
+            back.by_opacities,
+        )
+        assert (back.scales, back.opacities) == (render.scales, render.opacities)
+        assert result.grad2d.value.data_ptr() == project.of_grad2d
+        assert {name: p.grad.data_ptr() for name, p in model.named_parameters()} == {
+            "means": project.of_means, "quats": project.of_quats, "sh_dc": project.of_sh_dc,
+            "sh_rest": project.of_sh_rest, "log_scales": back.by_log_scales, "opacity_logits": back.by_logits,
+        }  # fmt: skip
+        kept = [result, loss, *(p.grad for p in model.parameters())]  # noqa: F841 - so that the next ones lie elsewhere
+        model.zero_grad(set_to_none=True)
 
 
 def test_a_picture_without_room_is_gone_on_with_and_one_of_too_many_pairs_refused(drawn, monkeypatch):

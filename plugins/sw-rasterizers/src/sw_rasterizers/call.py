@@ -70,6 +70,14 @@ class Call:
     seconds: dict[str, float] = field(default_factory=dict)
     counts: list[int] = field(default_factory=list)
 
+    def repeated(self, camera: list[float]) -> Call:
+        """Return the same for another camera of the same size, with buffers of its own."""
+        grad2d, absgrad2d = (None if buffer is None else GradBuffer() for buffer in (self.grad2d, self.absgrad2d))
+        return Call(
+            camera, self.width, self.height, self.sh_degree, self.scale_modifier, self.eps2d, self.flags,
+            self.geom_indices, self.visible, self.background, grad2d, absgrad2d,
+        )  # fmt: skip
+
 
 def camera_numbers(cam: Camera) -> list[float]:
     """Return the camera as [18] numbers: R row by row, tau, fx, fy, cx, cy, near, far."""

@@ -82,6 +82,12 @@ class Picture:
         behind = "background" if background is None or background.dim() == 1 else "backdrop"
         self.canvas: Arguments = {"channels": self.channels, "color_channels": self.colors, behind: background}
 
+    def settings(self) -> Arguments:
+        """Return all of it but the camera."""
+        found = {**self.view, **self.how, **self.canvas}
+        del found["camera"]
+        return found
+
     def empty_image(self, dtype: torch.dtype) -> Tensor:
         """Return an image without its pixels."""
         return empty((self.channels, *self.size), dtype)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import threading
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 
 import torch
@@ -24,6 +24,7 @@ from sw_rasterizers.cpu import (
     most_pairs,
 )
 from sw_rasterizers.native import MODULE, unavailable_on_cuda
+from sw_rasterizers.repeated import Repeated
 
 BYTES, COUNT, FOR_SCORES, ORDERED = map(int, (Flag.BYTES, Flag.COUNT, Flag.FOR_SCORES, Flag.ORDERED))
 NUMBERED = (1 << 31) - 1025
@@ -82,7 +83,16 @@ def check() -> None:
         raise NativeBuildError(str(unavailable_on_cuda()))
 
 
-def draw(picture: Picture, tensors: Tensors) -> Drawn:
+Again = dict[str, Repeated]
+"""Operations of drawings that are alike: of one size, with one background, of tensors of one form."""
+
+
+def again() -> Again:
+    """Return what a first drawing fills for those that are like it."""
+    return {name: Repeated(cuda_face, name) for name in ("render", "blend_backward", "project_backward")}
+
+
+def draw(picture: Picture, tensors: Tensors, again: Again | None = None) -> Drawn:
     """Draw one view; `tensors` by the names of INPUTS, contiguous. Fills counts of the call, and seconds if it counts.
 
     Memory for splats and pairs is that of recent calls and an eighth more, so that the device need not wait for the
@@ -103,7 +113,12 @@ def draw(picture: Picture, tensors: Tensors) -> Drawn:
     maps = real((7, *picture.size)) if flags & WITH_MAPS else None
     radii = means.new_empty(count, dtype=torch.int32)
     drawn = byte(count) if flags & SAVE else None
-    splats, seconds = None, 0.0
+    splats, seconds, camera = None, 0.0, tuple(call.camera)
+
+    def fixed() -> dict[str, Any]:
+        return {"geom_indices": call.geom_indices, "visible": call.visible, "count": count, "device": device,
+                **picture.settings()}  # fmt: skip
+
     while True:
         sizes = _plan(device, count, splat_room, room, *picture.size, picture.channels, picture.colors, flags)
         projected = splats is not None
@@ -112,14 +127,14 @@ def draw(picture: Picture, tensors: Tensors) -> Drawn:
         scratch = byte(sizes.scratch_bytes)
         pair_splats = means.new_empty(room, dtype=torch.int32), means.new_empty(room, dtype=torch.int32)
         # What is made here fits: addresses spare its checks, each as long as making it.
-        found = cuda_face.render(
-            **tensors, geom_indices=call.geom_indices, visible=call.visible, count=count, projected=projected,
+        render = _once(cuda_face.render) if again is None else again["render"]
+        found = render(
+            fixed, **{name: x for name, x in tensors.items() if x is not None}, camera=camera, projected=projected,
             mailbox=_MAILBOXES.address(device), splats=splats.data_ptr(), splat_bytes=splats.numel(),
             scratch=scratch.data_ptr(), scratch_bytes=scratch.numel(), lists=lists.data_ptr(),
             list_bytes=lists.numel(), first=pair_splats[0].data_ptr(), second=pair_splats[1].data_ptr(), room=room,
             splat_room=splat_room, radii=radii.data_ptr(), drawn=_at(drawn), image=_at(None if as_bytes else image),
             levels=_at(image if as_bytes else None), alpha=_at(alpha), median=_at(median), maps=_at(maps),
-            device=device, **picture.view, **picture.how, **picture.canvas,
         )  # fmt: skip
         seconds += found.project_seconds
         if found.pairs > most:
@@ -147,7 +162,7 @@ def row_length(picture: Picture, device: int, *, maps: bool = False) -> int:
     return _row_length(device, picture.channels, picture.colors, picture.flags, maps)
 
 
-def blend_backward(picture: Picture, count: int, kept: Kept, by: Tensors) -> Tensor:
+def blend_backward(picture: Picture, count: int, kept: Kept, by: Tensors, again: Again | None = None) -> Tensor:
     """Return sums [N, row_length] of N Gaussians from the gradients of a picture.
 
     by      gradients of "image", and of "alpha", "median", "maps" or None; contiguous
@@ -159,11 +174,19 @@ def blend_backward(picture: Picture, count: int, kept: Kept, by: Tensors) -> Ten
     if picture.flags & ORDERED:
         sizes = plan_sums(picture, count, kept, device, maps=maps, median=by.get("median") is not None)
         scratch = image.new_empty(sizes.blend_bytes, dtype=torch.uint8)
-    rows = image.new_empty(count, row_length(picture, device, maps=maps))
-    features = picture.channels - picture.colors - picture.depths
-    found = cuda_face.blend_backward(
-        **{f"by_{name}": x for name, x in by.items()}, lists=kept.lists, pair_splats=kept.pair_splats, **kept.sizes,
-        feature_channels=features, scratch=scratch, rows=rows, **picture.view, **picture.canvas,
+    length = row_length(picture, device, maps=maps)
+    rows = image.new_empty(count, length)
+
+    def fixed() -> dict[str, Any]:
+        more = {"feature_channels": picture.channels - picture.colors - picture.depths, "device": device}
+        unwanted = {"sh_degree", "scale_modifier", "eps2d"}
+        return {**{name: x for name, x in picture.settings().items() if name not in unwanted}, **more}
+
+    found = (_once(cuda_face.blend_backward) if again is None else again["blend_backward"])(
+        fixed, **{f"by_{name}": x for name, x in by.items() if x is not None}, camera=tuple(picture.call.camera),
+        lists=kept.lists.data_ptr(), list_bytes=kept.lists.numel(), pair_splats=kept.pair_splats.data_ptr(),
+        room=kept.pair_splats.numel(), **kept.sizes, scratch=_at(scratch),
+        scratch_bytes=0 if scratch is None else scratch.numel(), rows=rows.data_ptr(), count=count, row_length=length,
     )  # fmt: skip
     if picture.flags & COUNT:
         picture.call.seconds[BACKWARD_STAGES[0]] = found.blend_seconds
@@ -172,7 +195,7 @@ def blend_backward(picture: Picture, count: int, kept: Kept, by: Tensors) -> Ten
 
 def project_backward(
     picture: Picture, tensors: Tensors, drawn: Tensor, rows: Tensor, wanted: Collection[str],
-    updates: dict[str, AdamUpdate] | None = None, *, maps: bool = False,
+    updates: dict[str, AdamUpdate] | None = None, *, maps: bool = False, again: Again | None = None,
 ) -> dict[str, Tensor]:  # fmt: skip
     """Return the gradients that are wanted, by name of the input, or "grad2d" and "absgrad2d" [N,2].
 
@@ -193,10 +216,16 @@ def project_backward(
         if name in wanted and x is not None
     }
     made |= {name: means.new_empty(len(means), 2) for name in ("grad2d", "absgrad2d") if name in wanted}
-    found = cuda_face.project_backward(
-        **tensors, geom_indices=call.geom_indices, visible=call.visible, color_channels=picture.colors, drawn=drawn,
+
+    def fixed() -> dict[str, Any]:
+        more = {"geom_indices": call.geom_indices, "visible": call.visible, "color_channels": picture.colors}
+        unwanted = {"channels", "background", "backdrop"}
+        settings = {name: x for name, x in picture.settings().items() if name not in unwanted}
+        return {**settings, **more, **_adam("dc", done.get("sh_dc")), **_adam("rest", done.get("sh_rest"))}
+
+    found = (_once(cuda_face.project_backward) if again is None or done else again["project_backward"])(
+        fixed, **{name: x for name, x in tensors.items() if x is not None}, camera=tuple(call.camera), drawn=drawn,
         rows=rows, maps=maps, **{f"of_{name}": x.data_ptr() for name, x in made.items()},
-        **_adam("dc", done.get("sh_dc")), **_adam("rest", done.get("sh_rest")), **picture.view, **picture.how,
     )  # fmt: skip
     # Whoever offered an update sees by the version that it is done.
     torch.autograd.graph.increment_version([u.param for u in done.values()])
@@ -228,6 +257,11 @@ def visible_radii(call: Call, geometry: Tensors) -> Tensor:
         eps2d=call.eps2d,
     )  # fmt: skip
     return radii
+
+
+def _once(operation: Callable[..., Any]) -> Callable[..., Any]:
+    """Return an operation as something that is called as `Repeated` is."""
+    return lambda fixed, **changed: operation(**fixed(), **changed)
 
 
 def _at(tensor: Tensor | None) -> int | None:

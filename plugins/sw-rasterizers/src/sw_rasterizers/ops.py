@@ -100,14 +100,14 @@ _KEEPS_GRAPH: Callable[[], bool] = getattr(torch._C._autograd, "_get_current_gra
 
 def _gradients_on_cuda(
     picture: cpu.Picture, tensors: cpu.Tensors, kept: list[Any], by: cpu.Tensors, wanted: set[str],
-    updates: dict[str, AdamUpdate],
+    updates: dict[str, AdamUpdate], again: cuda.Again | None = None,
 ) -> dict[str, Tensor]:  # fmt: skip
     """Return the gradients that are wanted, and fill the statistics of the call; `kept` is empty thereafter."""
     call, shown, means = picture.call, kept[0].drawn, tensors["means"]
     statistics = {"grad2d": call.grad2d, "absgrad2d": call.absgrad2d}
     wanted = wanted | {name for name, buffer in statistics.items() if buffer is not None}
-    rows = cuda.blend_backward(picture, len(means), kept.pop(), by)
-    found = cuda.project_backward(picture, tensors, shown, rows, wanted, updates)
+    rows = cuda.blend_backward(picture, len(means), kept.pop(), by, again)
+    found = cuda.project_backward(picture, tensors, shown, rows, wanted, updates, again=again)
     for name, buffer in statistics.items():
         if buffer is not None:
             buffer.set(found[name])
@@ -147,10 +147,14 @@ def rasterize(call: Call, tensors: dict[str, Tensor | None]) -> tuple[Tensor, Te
     return _Rasterize.apply(call, dummy, *inputs)  # type: ignore[no-any-return]
 
 
-def draw_unrecorded(call: Call, tensors: dict[str, Tensor | None]) -> tuple[Drawing, Gradients]:
+def draw_unrecorded(
+    call: Call, tensors: dict[str, Tensor | None], again: cuda.Again | None = None
+) -> tuple[Drawing, Gradients]:
     """Draw one view as `rasterize` does, unknown to autograd; the second gives gradients, once, by names of INPUTS.
 
     Of all inputs, from the gradient of the image. It fills the statistics of the call.
+
+    again   of drawings on CUDA that are like this one
     """
     call.flags |= Flag.SAVE
     named = {name: None if (x := tensors.get(name)) is None else x.contiguous() for name in INPUTS}
@@ -158,16 +162,16 @@ def draw_unrecorded(call: Call, tensors: dict[str, Tensor | None]) -> tuple[Draw
     assert means is not None
     picture = cpu.Picture(call, named, int(call.flags))
     updates = _updates(tensors) if means.is_cuda else {}
-    drawn: Any = cuda.draw(picture, named) if means.is_cuda else cpu.draw(picture, named)
+    drawn: Any = cuda.draw(picture, named, again) if means.is_cuda else cpu.draw(picture, named)
     kept = [drawn.kept]  # gone before there is room for the gradients of the inputs
     wanted = {name for name, x in named.items() if x is not None}
     buffers = {"grad2d": call.grad2d, "absgrad2d": call.absgrad2d}
     statistics = {name: buffer for name, buffer in buffers.items() if buffer is not None}
 
     def gradients(by_image: Tensor) -> dict[str, Tensor]:
-        by = {"image": by_image, "alpha": None, "median": None}
+        by = {"image": by_image.contiguous(), "alpha": None, "median": None}
         if means.is_cuda:
-            return _gradients_on_cuda(picture, named, kept, by, wanted, updates)
+            return _gradients_on_cuda(picture, named, kept, by, wanted, updates, again)
         found = cpu.draw_backward(picture, named, kept.pop(), by, wanted | statistics.keys())
         for name, buffer in statistics.items():
             buffer.set(found[name])

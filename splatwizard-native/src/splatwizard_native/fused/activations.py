@@ -19,6 +19,8 @@ def activated(log_scales: Tensor, opacity_logits: Tensor) -> tuple[Tensor, Tenso
     """
     both = log_scales, opacity_logits
     if all(t.is_cuda and t.dtype == torch.float32 for t in both) and TRAINING.has_cuda():
+        if not torch.is_grad_enabled():
+            return _activate(log_scales.contiguous(), opacity_logits.contiguous())
         found: tuple[Tensor, Tensor] = _Activate.apply(*both)  # type: ignore[no-untyped-call]
         return found
     return torch.exp(log_scales), torch.sigmoid(opacity_logits)
@@ -42,15 +44,19 @@ def activation_gradients(
     return made[0], made[1]
 
 
+def _activate(log_scales: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
+    scales, opacities = torch.empty_like(log_scales), torch.empty_like(logits)
+    cuda_face.activate(
+        log_scales=log_scales, logits=logits, scale_count=scales.numel(), opacity_count=opacities.numel(),
+        scales=scales.data_ptr(), opacities=opacities.data_ptr(),
+    )  # fmt: skip
+    return scales, opacities
+
+
 class _Activate(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, log_scales: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
-        log_scales, logits = log_scales.contiguous(), logits.contiguous()
-        scales, opacities = torch.empty_like(log_scales), torch.empty_like(logits)
-        cuda_face.activate(
-            log_scales=log_scales, logits=logits, scale_count=scales.numel(), opacity_count=opacities.numel(),
-            scales=scales, opacities=opacities,
-        )  # fmt: skip
+        scales, opacities = _activate(log_scales.contiguous(), logits.contiguous())
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(scales, opacities)
         return scales, opacities

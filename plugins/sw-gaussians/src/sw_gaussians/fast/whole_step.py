@@ -63,15 +63,14 @@ class WholeStep:
         if truth.shape != (3, camera.height, camera.width) or truth.dtype != torch.float32 or truth.requires_grad:
             return None
         sh = SH(dc=params["sh_dc"], rest=sh_rest if sh_rest.shape[1] else None, active_degree=model.active_sh_degree)
+        options = stage.raster_options(state.step, background)
         with torch.no_grad():
             scales, opacities = activated(params["log_scales"], params["opacity_logits"])
-        g = GaussianInputs(params["means"], opacities, scales, params["quats"], sh=sh)
-        found = self._drawer(state.rasterizer, g, stage.raster_options(state.step, background))
-        if found is None:
-            return None
-        drawer, options = found
-        with torch.no_grad():
-            result, gradients = drawer.draw(g, camera, options)
+            g = GaussianInputs(params["means"], opacities, scales, params["quats"], sh=sh)
+            found = self._drawer(state.rasterizer, g, options)
+            if found is None:
+                return None
+            result, gradients = found[0].draw(g, camera, found[1])
             loss = photometric_gradient(result.image, truth, settings.lambda_dssim, settings.ssim_padding)
             if loss is None:
                 return None
@@ -94,7 +93,8 @@ class WholeStep:
         if isinstance(rasterizer, Chooses):
             opt = rasterizer.decided(opt)
             profile = {f"profile {opt.profile}"} if opt.profile else frozenset()
-            chosen = rasterizer.select(Feature.asked_by(opt, g).names | profile)
+            with torch.enable_grad():
+                chosen = rasterizer.select(Feature.asked_by(opt, g).names | profile)
             if chosen.info.name not in rasterizer.served:
                 return None
         if isinstance(chosen, Draws):

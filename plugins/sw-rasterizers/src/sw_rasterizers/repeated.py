@@ -1,0 +1,44 @@
+"""Calls of an operation that are alike, as those of a training's steps: the first one is checked."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+PLAIN = {int, float, bool, tuple}
+"""Types of values that are handed over as they are."""
+
+
+class Repeated:
+    """An operation that a training calls at each step, alike: the first call is checked, later ones only change values.
+
+    face    Python module of the face
+    name    of the operation
+    """
+
+    def __init__(self, face: Any, name: str) -> None:
+        self._face, self._name, self._call = face, name, None
+
+    def __call__(self, fixed: Callable[[], dict[str, Any]], **changed: Any) -> Any:
+        """Call it, and return its struct, each time the same one.
+
+        fixed   gives the arguments that are the same at all calls
+        changed tensors of the form that those of the first call had, numbers, tuples of them
+        """
+        call: Any = self._call
+        if call is None:
+            self._call = call = getattr(self._face, self._name)(**fixed(), **changed)
+            module = self._face.MODULE
+            self._reference, self._told = ctypes.byref(call), getattr(module.library, f"{module.name}_last_error")
+            self._function = getattr(module.library, f"{module.name}_{self._name}")
+            return call
+        for name, value in changed.items():
+            setattr(call, name, value if value is None or type(value) in PLAIN else value.data_ptr())
+        if call.device >= 0:
+            call.stream = torch._C._cuda_getCurrentRawStream(call.device)
+        if self._function(self._reference) != 0:
+            raise RuntimeError(f"{self._name}: {self._told().decode()}")
+        return call
