@@ -237,8 +237,10 @@ class ThreeDGSStage(Stage):
     def whole_step(
         self, state: TrainingState, view: View, camera: Camera, background: Tensor
     ) -> tuple[RenderResult, LossPack] | None:
-        plain = type(self) is ThreeDGSStage and type(self.control).regularised is DensityControl.regularised
-        return self._whole(self, state, view, camera, background) if plain else None
+        if type(self) is not ThreeDGSStage or type(self.control).regularised is not DensityControl.regularised:
+            return None
+        options = functools.partial(self.raster_options, state.step, background)
+        return self._whole(options, self.config.loss, state, view, camera, background)
 
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
         truth, settings = view.image(background, result.image.device), self.config.loss

@@ -34,7 +34,6 @@ def _of_inner(name: str, member: Any) -> Any:
 
 
 for _name, _member in vars(Stage).items():
-    # `when` scales by the hyper-parameters of the stage that asks; tasks of a configuration are added to the outer one;
-    # a whole step of the stage inside would pass over what the outer one overrides.
+    # `when` scales by the hyper-parameters of who asks, tasks are added to the outer one, a step is what that overrides.
     if not _name.startswith("_") and _name not in ("name", "when", "added", "whole_step"):
         setattr(WrappedStage, _name, _of_inner(_name, _member))

@@ -18,10 +18,8 @@ from splatwizard_core.training.params import OptimizationParams, PipelineParams
 from splatwizard_core.training.plan import When, scaled
 
 if TYPE_CHECKING:
-    from splatwizard_core.scene.camera import Camera
     from splatwizard_core.training.optimizer import SplatOptimizer
     from splatwizard_core.training.scheduler import Scheduler
-    from splatwizard_core.training.state import TrainingState
 
 
 class CameraSampler:
@@ -190,6 +188,9 @@ class Stage:
         self, state: TrainingState, view: View, camera: Camera, background: Tensor
     ) -> tuple[RenderResult, LossPack] | None:
         """Draw a view and find loss and gradients in one, as the parts of a step do, faster; None: the parts shall."""
+
+    def whole_step(self, state: Any, view: View, camera: Any, background: Tensor) -> Any:
+        """Return a TrainingState's (RenderResult, LossPack), gradients made, faster than by parts; None: take these."""
         return None
 
     def finish(self, model: SplatModel, scene: Scene) -> SplatModel:

@@ -61,21 +61,23 @@ def _means(
     On the CPU the gradient is computed along with the value; on CUDA no number is waited for, and the gradient is put
     together when its scale is known.
     """
-    image, target = (t.reshape(-1, *t.shape[-2:]).contiguous() for t in (x, y))
+    image, target = (t.reshape(-1, *t.shape[-2:]).contiguous() if t.dim() != 3 else t.contiguous() for t in (x, y))
     planes, height, width = image.shape
     if x.is_cuda:
         total, l1, similarity = found = tuple(image.new_empty(()) for _ in range(3))
         slopes = image.new_empty(3, *image.shape) if learns else None
-        cuda_face.photometric_loss(
-            x=image, y=target, **weights, offset=offset, total=total, l1=l1, ssim=similarity, slopes=slopes,
-            sums=image.new_empty(2 + 2 * planes * -(-height // TILE) * -(-width // TILE)),
+        sums = image.new_empty(2 + 2 * planes * -(-height // TILE) * -(-width // TILE))
+        cuda_face.photometric_loss(  # addresses of what is made here, which fits, spare its checks
+            x=image, y=target, **weights, offset=offset, total=total.data_ptr(), l1=l1.data_ptr(),
+            ssim=similarity.data_ptr(), slopes=None if slopes is None else slopes.data_ptr(), sums=sums.data_ptr(),
+            sum_count=sums.numel(),
         )  # fmt: skip
         return found, (image, target, slopes)
     grad = torch.empty_like(image) if learns else None
     row_sums = image.new_empty(2, planes, height, dtype=torch.float64)
     told = face.photometric(x=image, y=target, **weights, grad=grad, row_sums=row_sums)
-    sums = offset + weights["l1_weight"] * told.l1 + weights["ssim_weight"] * told.ssim, told.l1, told.ssim
-    return tuple(map(x.new_tensor, sums)), (grad,)
+    total = offset + weights["l1_weight"] * told.l1 + weights["ssim_weight"] * told.ssim
+    return tuple(map(x.new_tensor, (total, told.l1, told.ssim))), (grad,)
 
 
 def _gradient(kept: Sequence[Tensor], weights: dict[str, Any], scale: Tensor) -> Tensor:
@@ -83,7 +85,7 @@ def _gradient(kept: Sequence[Tensor], weights: dict[str, Any], scale: Tensor) ->
     if scale.is_cuda:
         x, y, slopes = kept
         grad = torch.empty_like(x)
-        cuda_face.photometric_loss_backward(x=x, y=y, slopes=slopes, **weights, scale=scale, grad=grad)
+        cuda_face.photometric_loss_backward(x=x, y=y, slopes=slopes, **weights, scale=scale, grad=grad.data_ptr())
         return grad
     grad = kept[0]
     return grad if float(scale) == 1.0 else grad * scale  # nearly always the loss itself is differentiated

@@ -17,7 +17,7 @@ from splatwizard_native import activated, activation_gradients, photometric_grad
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Camera, Rasterizer, SplatModel, TrainingState, View
-    from sw_gaussians.stage import ThreeDGSStage
+    from sw_gaussians.config import Loss
 
 
 @runtime_checkable
@@ -52,18 +52,24 @@ class WholeStep:
         self._found: tuple[Draws, RasterOptions] | None = None
 
     def __call__(
-        self, stage: ThreeDGSStage, state: TrainingState, view: View, camera: Camera, background: Tensor
+        self,
+        asked: Callable[[], RasterOptions],
+        settings: Loss,
+        state: TrainingState,
+        view: View,
+        camera: Camera,
+        background: Tensor,
     ) -> tuple[RenderResult, LossPack] | None:
-        """Do what `Stage.whole_step` says, or None."""
+        """Do what `Stage.whole_step` says, with these options and this loss; None where it cannot."""
         model = state.model
         if not is_plain(model) or not torch.is_grad_enabled():
             return None
         params: dict[str, Any] = model._parameters
-        sh_rest, settings, truth = params["sh_rest"], stage.config.loss, view.image(background, params["means"].device)
+        sh_rest, truth = params["sh_rest"], view.image(background, params["means"].device)
         if truth.shape != (3, camera.height, camera.width) or truth.dtype != torch.float32 or truth.requires_grad:
             return None
         sh = SH(dc=params["sh_dc"], rest=sh_rest if sh_rest.shape[1] else None, active_degree=model.active_sh_degree)
-        options = stage.raster_options(state.step, background)
+        options = asked()
         with torch.no_grad():
             scales, opacities = activated(params["log_scales"], params["opacity_logits"])
             g = GaussianInputs(params["means"], opacities, scales, params["quats"], sh=sh)
