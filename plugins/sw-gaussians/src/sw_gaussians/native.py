@@ -1,7 +1,5 @@
 """Native modules of this package: sparse Adam, prices of merging; on CUDA also gradient statistics and normals."""
 
-from __future__ import annotations
-
 from splatwizard_native import NativeModule
 
 GAUSSIANS_CUDA = NativeModule(

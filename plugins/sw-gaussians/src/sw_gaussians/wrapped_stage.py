@@ -34,6 +34,6 @@ def _of_inner(name: str, member: Any) -> Any:
 
 
 for _name, _member in vars(Stage).items():
-    # `when` scales by the hyper-parameters of who asks, tasks are added to the outer one, a step is what that overrides.
+    # `when` scales by hyper-parameters of who asks, tasks are added to the outer one, steps made of what it overrides.
     if not _name.startswith("_") and _name not in ("name", "when", "added", "whole_step"):
         setattr(WrappedStage, _name, _of_inner(_name, _member))
