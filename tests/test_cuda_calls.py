@@ -98,8 +98,10 @@ def test_training(calls):
     log_scales, logits = rand(5, 3, grad=True), rand(5, grad=True)
     _, opacities = activated(log_scales, logits)
     assert (calls["activate"][0].scale_count, calls["activate"][0].opacity_count) == (15, 5)
-    torch.autograd.grad(opacities, logits, rand(5))
-    (back,) = calls["activate_backward"]
+    torch.autograd.grad(opacities, logits, rand(5), retain_graph=True)
+    (slope,) = torch.autograd.grad(opacities, logits, rand(5), create_graph=True)
+    assert slope.requires_grad
+    (back,) = calls["activate_backward"]  # not of what is differentiated again
     assert (back.scale_count, back.opacity_count, back.by_scales, back.by_log_scales) == (0, 5, None, None)
     assert back.opacities == opacities.data_ptr()
 
@@ -197,13 +199,26 @@ def test_pictures(drawn):
     assert list(project.rest_rates)[:4] == pytest.approx([0.1 / (1 - 0.9**2), 0.1, 0.99, 0.01])
     assert call.grad2d.value.shape == (8, 2)
 
-    with torch.no_grad():
-        image, *_ = ops.rasterize(view_of(flags=4 | 8192 | 32768), tensors)
-    assert (image.dtype, drawn["render"][1].levels) == (torch.uint8, image.data_ptr())
-    assert (drawn["render"][1].drawn, drawn["render"][1].image) == (None, None)
+
+def test_pictures_of_inference(drawn, monkeypatch):
+    from splatwizard_core.api import SH, Camera, GaussianInputs, RasterOptions
+    from sw_rasterizers.inference import FlashRasterizer, TensorCoreRasterizer
+
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (9, 0))
+    dc, rest = (tensors := tensors_of()).pop("sh_dc"), tensors.pop("sh_rest")
+    g = GaussianInputs(**tensors, sh=SH(dc=dc, rest=rest, active_degree=1))
+    camera = Camera(32, 24, 30.0, 30.0, 16.0, 12.0, torch.eye(3), torch.ones(3))
+    for kind in (FlashRasterizer, TensorCoreRasterizer):
+        with torch.no_grad():
+            image = kind().render(g, camera, RasterOptions(dtype_out="uint8")).image
+        render = drawn["render"].pop()
+        assert (image.dtype, render.levels) == (torch.uint8, image.data_ptr())
+        assert (render.drawn, render.image) == (None, None)
+        assert render.flags & (8192 | 16384) == kind.method
 
 
-def test_a_whole_step(drawn, monkeypatch):
+def stage_of(monkeypatch, **how: Any) -> tuple[Any, Any, Any, Any]:
+    """A stage and what its whole step takes: state, view, camera."""
     from sw_gaussians.config import GaussianTraining
     from sw_gaussians.stage import ThreeDGSStage
 
@@ -217,9 +232,14 @@ def test_a_whole_step(drawn, monkeypatch):
     raw = {"opacity_logits": inputs.pop("opacities"), "log_scales": inputs.pop("scales"), **inputs}
     model = GaussianModel.from_tensors(**raw)
     camera = Camera(32, 24, 30.0, 30.0, 16.0, 12.0, torch.eye(3), torch.ones(3))
-    view: Any = SimpleNamespace(image=lambda background, device: rand(3, 24, 32))
-    state: Any = SimpleNamespace(model=model, rasterizer=StandardRasterizer(), step=1)
-    stage, background = ThreeDGSStage(GaussianTraining()), rand(3)
+    view = SimpleNamespace(image=lambda background, device: rand(3, 24, 32))
+    state = SimpleNamespace(model=model, rasterizer=StandardRasterizer(), step=1)
+    return ThreeDGSStage(GaussianTraining(), **how), state, view, camera
+
+
+def test_a_whole_step(drawn, monkeypatch):
+    stage, state, view, camera = stage_of(monkeypatch)
+    model, background = state.model, rand(3)
     for seed in range(3):  # the first is checked, the next are like it
         camera = dataclasses.replace(camera, tau=torch.tensor([0.0, 0.0, seed]))
         result, loss = stage.whole_step(state, view, camera, background)
@@ -248,6 +268,21 @@ def test_a_whole_step(drawn, monkeypatch):
         }  # fmt: skip
         kept = [result, loss, *(p.grad for p in model.parameters())]  # noqa: F841 - so that the next ones lie elsewhere
         model.zero_grad(set_to_none=True)
+
+
+def test_updates_in_the_backward_pass_are_counted_and_the_others_done_by_the_optimizer(drawn, monkeypatch):
+    stage, state, view, camera = stage_of(monkeypatch, fuses_updates=True)
+    optimizer = stage.create_optimizer(state.model, SimpleNamespace(extent=1.0))
+    stage._post = SimpleNamespace(registrations=[])
+    for _ in range(3):
+        optimizer.step(stage.whole_step(state, view, camera, rand(3))[0])
+        optimizer.zero_grad()
+    assert [call.count for call in drawn["adam"]] == [6, 4, 4]  # moments exist from the first update on
+    moments, first = optimizer.states["sh_rest"].tensors, optimizer.groups["sh_rest"].lr / (1 - 0.9**3)
+    last = drawn["project_backward"][-1]
+    assert (last.rest_exp_avg, last.of_sh_rest) == (moments["exp_avg"].data_ptr(), None)
+    assert last.rest_rates[0] == pytest.approx(first)
+    assert {name: each.step for name, each in optimizer.states.items()} == dict.fromkeys(optimizer.groups, 3)
 
 
 def test_a_picture_without_room_is_gone_on_with_and_one_of_too_many_pairs_refused(drawn, monkeypatch):

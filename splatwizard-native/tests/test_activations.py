@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from splatwizard_native import activated
-from splatwizard_native.fused.native import TRAINING
 
 CUDA = pytest.param(
     "cuda", marks=[pytest.mark.cuda, pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")]
@@ -58,14 +57,14 @@ def test_other_types_and_places_are_torchs(device):
     torch.testing.assert_close(opacities, whole.sigmoid(), rtol=3e-7, atol=0)
 
 
-@pytest.mark.cuda
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
-def test_a_second_derivative_is_refused_on_cuda():
-    assert TRAINING.has_cuda()
-    log_scales, logits = leaves("cuda")
-    (slope,) = torch.autograd.grad(activated(log_scales, logits)[0].sum(), log_scales, create_graph=True)
-    with pytest.raises(RuntimeError, match="twice"):
-        torch.autograd.grad(slope.sum(), log_scales)
+@pytest.mark.parametrize("device", ["cpu", CUDA])
+def test_second_derivatives_are_torchs(device):
+    ours, theirs = leaves(device), leaves(device)
+    for given, (scales, opacities) in ((ours, activated(*ours)), (theirs, (theirs[0].exp(), theirs[1].sigmoid()))):
+        slopes = torch.autograd.grad(scales.sum() + opacities.square().sum(), given, create_graph=True)
+        sum(slope.square().sum() for slope in slopes).backward()
+    for a, b in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(a.grad, b.grad, rtol=1e-5, atol=1e-9)
 
 
 @pytest.mark.cuda

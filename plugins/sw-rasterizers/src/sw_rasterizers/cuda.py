@@ -227,8 +227,9 @@ def project_backward(
         fixed, **{name: x for name, x in tensors.items() if x is not None}, camera=tuple(call.camera), drawn=drawn,
         rows=rows, maps=maps, **{f"of_{name}": x.data_ptr() for name, x in made.items()},
     )  # fmt: skip
-    # Whoever offered an update sees by the version that it is done.
-    torch.autograd.graph.increment_version([u.param for u in done.values()])
+    # Whoever offered an update sees by the version that it is done: of what was drawn, since the update may name an
+    # alias that counts on its own, as `param.data` does.
+    torch.autograd.graph.increment_version([x for name in done if (x := tensors[name]) is not None])
     if picture.flags & COUNT:
         call.seconds[BACKWARD_STAGES[1]] = found.project_seconds
     return made

@@ -23,14 +23,14 @@ class InferenceRasterizer(StandardRasterizer):
 
     method: Flag
 
-    def _call(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> Call:
+    def _call(self, g: GaussianInputs, cam: Camera, opt: RasterOptions, *, learns: bool) -> Call:
         least = self.info.min_cc
         if least is not None and torch.cuda.get_device_capability(g.means.device) < least:
             raise CapabilityError(
                 f"rasterizer '{self.info.name}' needs a GPU of compute capability {least[0]}.{least[1]} or higher",
                 missing=frozenset(),
             )
-        call = super()._call(g, cam, opt)
+        call = super()._call(g, cam, opt, learns=learns)
         call.flags |= self.method
         if opt.dtype_out == "uint8":
             call.flags |= Flag.BYTES
@@ -53,7 +53,7 @@ class TensorCoreRasterizer(InferenceRasterizer):
     info: RasterizerInfo = RasterizerInfo.declared(plugin.register_rasterizers, "tcgs")
     method = Flag.TENSOR_CORES
 
-    def _call(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> Call:
+    def _call(self, g: GaussianInputs, cam: Camera, opt: RasterOptions, *, learns: bool) -> Call:
         if opt.eps2d < 0.1:
             raise ConfigError(f"rasterizer 'tcgs' needs eps2d of 0.1 or more, got {opt.eps2d}")
-        return super()._call(g, cam, opt)
+        return super()._call(g, cam, opt, learns=learns)

@@ -6,7 +6,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from splatwizard_native.fused import cuda_face
 from splatwizard_native.fused.native import TRAINING
@@ -29,9 +28,12 @@ def activated(log_scales: Tensor, opacity_logits: Tensor) -> tuple[Tensor, Tenso
 def activation_gradients(
     scales: Tensor, opacities: Tensor, by_scales: Tensor | None, by_opacities: Tensor | None
 ) -> tuple[Tensor | None, Tensor | None]:
-    """Return the gradients by what `activated` was given, from its results and the gradients by these, contiguous."""
+    """Return the gradients by what `activated` was given, from its results and the gradients by these, contiguous.
+
+    By torch, and so to be differentiated again, where autograd records; elsewhere the kernel's if there is one.
+    """
     given = by_scales, by_opacities
-    if not (scales.is_cuda and scales.dtype == torch.float32 and TRAINING.has_cuda()):
+    if torch.is_grad_enabled() or not (scales.is_cuda and scales.dtype == torch.float32 and TRAINING.has_cuda()):
         sigmoid_backward = torch.ops.aten.sigmoid_backward
         by_logits = None if by_opacities is None else sigmoid_backward(by_opacities, opacities)
         return None if by_scales is None else by_scales * scales, by_logits
@@ -62,7 +64,6 @@ class _Activate(torch.autograd.Function):
         return scales, opacities
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         wanted = zip(grads, ctx.needs_input_grad, strict=True)
         given = [g.contiguous() if g is not None and asked else None for g, asked in wanted]
