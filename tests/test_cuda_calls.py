@@ -78,7 +78,6 @@ def calls(monkeypatch) -> Iterator[dict[str, list[Any]]]:
 
 
 def test_training(calls):
-    from splatwizard_native.fused.activations import activated
     from splatwizard_native.fused.adam import AdamUpdate, adam_steps
     from splatwizard_native.fused.photometric import photometric
 
@@ -94,16 +93,6 @@ def test_training(calls):
     with torch.no_grad():
         photometric(x, y, 0.2, "valid")
     assert (calls["photometric_loss"][1].slopes, calls["photometric_loss"][1].valid) == (None, True)
-
-    log_scales, logits = rand(5, 3, grad=True), rand(5, grad=True)
-    _, opacities = activated(log_scales, logits)
-    assert (calls["activate"][0].scale_count, calls["activate"][0].opacity_count) == (15, 5)
-    torch.autograd.grad(opacities, logits, rand(5), retain_graph=True)
-    (slope,) = torch.autograd.grad(opacities, logits, rand(5), create_graph=True)
-    assert slope.requires_grad
-    (back,) = calls["activate_backward"]  # not of what is differentiated again
-    assert (back.scale_count, back.opacity_count, back.by_scales, back.by_log_scales) == (0, 5, None, None)
-    assert back.opacities == opacities.data_ptr()
 
     update = AdamUpdate(*(rand(4, 4) for _ in range(4)), lr=0.1, beta1=0.9, beta2=0.99, eps=1e-8, step=1)
     version = update.param._version
@@ -223,10 +212,8 @@ def stage_of(monkeypatch, **how: Any) -> tuple[Any, Any, Any, Any]:
     from sw_gaussians.stage import ThreeDGSStage
 
     from splatwizard_core.api import Camera, GaussianModel
-    from splatwizard_native.fused import photometric
     from sw_rasterizers.standard import StandardRasterizer
 
-    monkeypatch.setattr(photometric, "_one", lambda device: torch.ones(()))
     monkeypatch.setattr(torch, "zeros", lambda n, dtype, device: rand(n))
     inputs = tensors_of()
     raw = {"opacity_logits": inputs.pop("opacities"), "log_scales": inputs.pop("scales"), **inputs}
@@ -243,9 +230,8 @@ def test_a_whole_step(drawn, monkeypatch):
     for seed in range(3):  # the first is checked, the next are like it
         camera = dataclasses.replace(camera, tau=torch.tensor([0.0, 0.0, seed]))
         result, loss = stage.whole_step(state, view, camera, background)
-        render, blend, project, back, first, slope = (drawn[name][seed] for name in (
-            "render", "blend_backward", "project_backward", "activate_backward", "photometric_loss",
-            "photometric_loss_backward",
+        render, blend, project, first, slope = (drawn[name][seed] for name in (
+            "render", "blend_backward", "project_backward", "photometric_loss", "photometric_loss_backward",
         ))  # fmt: skip
         assert render.camera[11] == blend.camera[11] == project.camera[11] == seed
         assert (render.background, blend.background, render.count) == (background.data_ptr(), background.data_ptr(), 8)
@@ -254,17 +240,14 @@ def test_a_whole_step(drawn, monkeypatch):
         assert (blend.lists, blend.pair_splats, blend.used) == (render.lists, render.second, 7)
         assert (render.image, render.radii) == (first.x, result.radii.data_ptr())
         assert (render.image, loss.total.data_ptr()) == (result.image.data_ptr(), first.total)
-        assert (slope.slopes, slope.grad) == (first.slopes, blend.by_image)
-        assert (blend.rows, project.of_scales, project.of_opacities) == (
-            project.rows,
-            back.by_scales,
-            back.by_opacities,
-        )
-        assert (back.scales, back.opacities) == (render.scales, render.opacities)
+        assert (slope.slopes, slope.grad, slope.scale) == (first.slopes, blend.by_image, None)
+        assert blend.rows == project.rows
         assert result.grad2d.value.data_ptr() == project.of_grad2d
-        assert {name: p.grad.data_ptr() for name, p in model.named_parameters()} == {
+        made = {name: p.grad.data_ptr() for name, p in model.named_parameters()}
+        assert made.pop("opacity_logits") != project.of_opacities  # times the slope of the sigmoid
+        assert made == {
             "means": project.of_means, "quats": project.of_quats, "sh_dc": project.of_sh_dc,
-            "sh_rest": project.of_sh_rest, "log_scales": back.by_log_scales, "opacity_logits": back.by_logits,
+            "sh_rest": project.of_sh_rest, "log_scales": project.of_scales,
         }  # fmt: skip
         kept = [result, loss, *(p.grad for p in model.parameters())]  # noqa: F841 - so that the next ones lie elsewhere
         model.zero_grad(set_to_none=True)

@@ -204,7 +204,7 @@ def room(module: str) -> str:
 CIRCLES_OF_TYPES = [
     {"splatwizard_core.method", "splatwizard_core.plugins", "splatwizard_core.plugins.hookspecs",
      "splatwizard_core.plugins.manager", "splatwizard_core.plugins.origins", "splatwizard_core.runs.observers"},
-    {"splatwizard_native", "splatwizard_native.fused.activations", "splatwizard_native.fused.adam",
+    {"splatwizard_native", "splatwizard_native.fused.adam",
      "splatwizard_native.fused.in_backward", "splatwizard_native.fused.native", "splatwizard_native.fused.photometric"},
     {"sw_interchange.frames", "sw_interchange.scene"},
     {"sw_interchange.spz", "sw_interchange.spz_fields"},

@@ -8,8 +8,6 @@ from splatwizard_native.errors import ForeseenError as ForeseenError
 from splatwizard_native.errors import NativeBuildError as NativeBuildError
 from splatwizard_native.errors import shortened as shortened
 from splatwizard_native.face_operations import operations as operations
-from splatwizard_native.fused.activations import activated as activated
-from splatwizard_native.fused.activations import activation_gradients as activation_gradients
 from splatwizard_native.fused.adam import AdamUpdate as AdamUpdate
 from splatwizard_native.fused.adam import adam_steps as adam_steps
 from splatwizard_native.fused.in_backward import end_offer as end_offer

@@ -14,7 +14,6 @@ from splatwizard_core.gaussians.inputs import SH, GaussianInputs, check_shape
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.streams import stream
-from splatwizard_native import activated
 
 if TYPE_CHECKING:
     from splatwizard_core.rendering.rasterizer import Rasterizer
@@ -136,13 +135,9 @@ class GaussianModel(SplatModel):
 
     def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
         """All Gaussians, whatever the camera; colours stay in two tensors, so nothing is concatenated."""
-        kind, rest = type(self), self.sh_rest if self.max_sh_degree > 0 else None
-        if kind.scales is GaussianModel.scales and kind.opacities is GaussianModel.opacities:
-            scales, opacities = activated(self.log_scales, self.opacity_logits)
-        else:
-            scales, opacities = self.scales, self.opacities  # a subclass has its own
+        rest = self.sh_rest if self.max_sh_degree > 0 else None
         sh = SH(dc=self.sh_dc, rest=rest, active_degree=self.active_sh_degree)
-        return GaussianInputs(self.means, opacities, scales, self.quats, sh=sh)
+        return GaussianInputs(self.means, self.opacities, self.scales, self.quats, sh=sh)
 
     def next_split_generator(self) -> torch.Generator:
         """The random stream of the next split: a function of `split_seed` and of how many splits there were.

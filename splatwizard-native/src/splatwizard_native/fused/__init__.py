@@ -1,1 +1,1 @@
-"""Operations that a training repeats at every step, fused: activations, the photometric loss and Adam."""
+"""Operations that a training repeats at every step, fused: the photometric loss and Adam."""

@@ -54,25 +54,19 @@ def _fused(updates: Sequence[AdamUpdate], device: torch.device) -> list[AdamUpda
     """Do these updates, of tensors on a device with kernels, in one call; return those that they do not take."""
     operations: Any = cuda_face if device.type == "cuda" else face
     alignment, more = (16, {"device": device.index}) if device.type == "cuda" else (1, {})
-    index, real = -1 if device.index is None else device.index, torch.float32
-    rows, held, left = [], [], []
+    index, rows, held, left = -1 if device.index is None else device.index, [], [], []
     for u in updates:
         p, g, m, v = tensors = u.param, u.grad.contiguous(), u.exp_avg, u.exp_avg_sq
         at = p.data_ptr(), g.data_ptr(), m.data_ptr(), v.data_ptr()
-        if (
-            p.dtype is g.dtype is m.dtype is v.dtype is real
-            and p.get_device() == g.get_device() == m.get_device() == v.get_device() == index
-            and p.is_contiguous()
-            and m.is_contiguous()
-            and v.is_contiguous()
-            and (at[0] | at[1] | at[2] | at[3]) % alignment == 0
-        ):
+        whole = p.is_contiguous() and m.is_contiguous() and v.is_contiguous()
+        here = p.get_device() == g.get_device() == m.get_device() == v.get_device() == index
+        aligned = (at[0] | at[1] | at[2] | at[3]) % alignment == 0
+        if whole and here and aligned and p.dtype is g.dtype is m.dtype is v.dtype is torch.float32:
             held.append(tensors)  # alive until the call
             rows.append((*at, p.numel(), u.lr, u.beta1, u.beta2, u.eps, u.step))
         else:
             left.append(u)
-    listed = operations.adam_update * len(rows)
-    operations.adam(updates=listed(*rows), count=len(rows), **more)
+    operations.adam(updates=(operations.adam_update * len(rows))(*rows), count=len(rows), **more)
     torch.autograd.graph.increment_version([tensors[0] for tensors in held])
     return left
 

@@ -1,7 +1,5 @@
 """The operations of kernels/cuda/face.h on a GPU."""
 
-from __future__ import annotations
-
 from splatwizard_native.face_operations import operations
 from splatwizard_native.fused.native import TRAINING_CUDA as MODULE
 

@@ -47,30 +47,8 @@ def photometric_loss_backward(
     valid: bool,
     l1_weight: float,
     ssim_weight: float,
-    scale: Tensor | Array[Any] | int,
+    scale: Tensor | Array[Any] | int | None = None,
     grad: Tensor | Array[Any] | int,
-    device: int | None = None,
-) -> Structure: ...
-def activate(
-    *,
-    log_scales: Tensor | Array[Any] | int,
-    logits: Tensor | Array[Any] | int,
-    scale_count: int,
-    opacity_count: int,
-    scales: Tensor | Array[Any] | int,
-    opacities: Tensor | Array[Any] | int,
-    device: int | None = None,
-) -> Structure: ...
-def activate_backward(
-    *,
-    scales: Tensor | Array[Any] | int,
-    opacities: Tensor | Array[Any] | int,
-    scale_count: int,
-    opacity_count: int,
-    by_scales: Tensor | Array[Any] | int | None = None,
-    by_opacities: Tensor | Array[Any] | int | None = None,
-    by_log_scales: Tensor | Array[Any] | int | None = None,
-    by_logits: Tensor | Array[Any] | int | None = None,
     device: int | None = None,
 ) -> Structure: ...
 def adam(

@@ -1,7 +1,5 @@
 """The operations of kernels/face.h on the CPU."""
 
-from __future__ import annotations
-
 from splatwizard_native.face_operations import operations
 from splatwizard_native.fused.native import TRAINING as MODULE
 

@@ -1,7 +1,5 @@
 """The native modules of the fused operations."""
 
-from __future__ import annotations
-
 from splatwizard_native.module import NativeModule
 
 TRAINING_CUDA = NativeModule(
@@ -9,8 +7,8 @@ TRAINING_CUDA = NativeModule(
     package="splatwizard_native.fused",
     sources=("kernels/cuda/face.cpp",),
     headers=("kernels/face.h", "kernels/cuda/*.h"),
-    cuda_sources=("kernels/cuda/ssim.cu", "kernels/cuda/adam.cu", "kernels/cuda/activations.cu"),
-    without="activations, loss and optimizer run on torch operations: the same numbers, slower",
+    cuda_sources=("kernels/cuda/ssim.cu", "kernels/cuda/adam.cu"),
+    without="loss and optimizer run on torch operations: the same numbers, slower",
     face="kernels/cuda/face.h",
 )
 

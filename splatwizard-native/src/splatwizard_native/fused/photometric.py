@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
@@ -34,9 +33,9 @@ def photometric(
     padding         of SSIM: "same", zeros beside the image; "valid": only where the window fits
     Source: Wang et al. 2004: window 11 x 11, Gaussian with sigma 1.5, per channel; moments as E[ab] - E[a]E[b].
     """
-    fused = _fused(image, target)
-    if fused is not None:
-        return fused(image, target, padding == "valid", 1.0 - lambda_dssim, -lambda_dssim, lambda_dssim)
+    if _has_kernel(image, target):
+        given = torch.is_grad_enabled() and image.requires_grad, image, target, lambda_dssim, padding
+        return _Photometric.apply(*given)  # type: ignore[no-any-return, no-untyped-call]
     l1 = (image - target).abs().mean()
     similarity = ssim_map(image, target, padding).mean()
     return (1.0 - lambda_dssim) * l1 + lambda_dssim * (1.0 - similarity), l1.detach(), similarity.detach()
@@ -46,65 +45,56 @@ def photometric_gradient(
     image: Tensor, target: Tensor, lambda_dssim: float, padding: Padding = "same"
 ) -> tuple[Tensor, Tensor, Tensor, Tensor] | None:
     """Return what `photometric` does and the gradient by `image`, unknown to autograd; None: no kernel takes these."""
-    if _fused(image, target) is None:
+    if not _has_kernel(image, target):
         return None
-    weights = {"valid": padding == "valid", "l1_weight": 1.0 - lambda_dssim, "ssim_weight": -lambda_dssim}
-    (total, l1, similarity), kept = _means(image, target, weights, lambda_dssim, learns=True)
-    return total, l1, similarity, _gradient(kept, weights, _one(image.device)).view(image.shape)
+    (total, l1, similarity), weights, kept = _means(image, target, lambda_dssim, padding, learns=True)
+    return total, l1, similarity, _gradient(weights, kept).view(image.shape)
 
 
 def _means(
-    x: Tensor, y: Tensor, weights: dict[str, Any], offset: float, *, learns: bool
-) -> tuple[tuple[Tensor, ...], tuple[Any, ...]]:
-    """Return the total and both means, each a tensor of its own, and what `_gradient` needs.
+    x: Tensor, y: Tensor, lambda_dssim: float, padding: Padding, *, learns: bool
+) -> tuple[tuple[Tensor, ...], dict[str, Any], tuple[Any, ...]]:
+    """Return the total and both means, each a tensor of its own, and what `_gradient` needs: weights and tensors.
 
     On the CPU the gradient is computed along with the value; on CUDA no number is waited for, and the gradient is put
     together when its scale is known.
     """
     image, target = (t.reshape(-1, *t.shape[-2:]).contiguous() if t.dim() != 3 else t.contiguous() for t in (x, y))
     planes, height, width = image.shape
+    weights = dict[str, Any](valid=padding == "valid", l1_weight=1.0 - lambda_dssim, ssim_weight=-lambda_dssim)
     if x.is_cuda:
         total, l1, similarity = found = tuple(image.new_empty(()) for _ in range(3))
         slopes = image.new_empty(3, *image.shape) if learns else None
         sums = image.new_empty(2 + 2 * planes * -(-height // TILE) * -(-width // TILE))
         cuda_face.photometric_loss(  # addresses of what is made here, which fits, spare its checks
-            x=image, y=target, **weights, offset=offset, total=total.data_ptr(), l1=l1.data_ptr(),
+            x=image, y=target, **weights, offset=lambda_dssim, total=total.data_ptr(), l1=l1.data_ptr(),
             ssim=similarity.data_ptr(), slopes=None if slopes is None else slopes.data_ptr(), sums=sums.data_ptr(),
             sum_count=sums.numel(),
         )  # fmt: skip
-        return found, (image, target, slopes)
+        return found, weights, (image, target, slopes)
     grad = torch.empty_like(image) if learns else None
     row_sums = image.new_empty(2, planes, height, dtype=torch.float64)
     told = face.photometric(x=image, y=target, **weights, grad=grad, row_sums=row_sums)
-    total = offset + weights["l1_weight"] * told.l1 + weights["ssim_weight"] * told.ssim
-    return tuple(map(x.new_tensor, (total, told.l1, told.ssim))), (grad,)
+    whole = lambda_dssim + weights["l1_weight"] * told.l1 + weights["ssim_weight"] * told.ssim
+    return tuple(map(x.new_tensor, (whole, told.l1, told.ssim))), weights, (grad,)
 
 
-def _gradient(kept: Sequence[Tensor], weights: dict[str, Any], scale: Tensor) -> Tensor:
-    """Return `scale` times the gradient of the total by the image, [planes, H, W]."""
-    if scale.is_cuda:
+def _gradient(weights: dict[str, Any], kept: Sequence[Tensor], scale: Tensor | None = None) -> Tensor:
+    """Return `scale`, or 1, times the gradient of the total by the image, [planes, H, W]."""
+    if kept[0].is_cuda:
         x, y, slopes = kept
         grad = torch.empty_like(x)
         cuda_face.photometric_loss_backward(x=x, y=y, slopes=slopes, **weights, scale=scale, grad=grad.data_ptr())
         return grad
-    grad = kept[0]
-    return grad if float(scale) == 1.0 else grad * scale  # nearly always the loss itself is differentiated
+    return kept[0] if scale is None or float(scale) == 1.0 else kept[0] * scale  # 1 but for weighted losses
 
 
-@functools.cache
-def _one(device: torch.device) -> Tensor:
-    return torch.ones((), device=device)
-
-
-class _Photometric(torch.autograd.Function):
-    """offset + l1_weight * L1 + ssim_weight * SSIM, and both means."""
-
+class _Photometric(torch.autograd.Function):  # (learns, x, y, lambda, padding) -> total, L1, SSIM
     @staticmethod
     def forward(
-        ctx: Any, learns: bool, x: Tensor, y: Tensor, valid: bool, l1_weight: float, ssim_weight: float, offset: float
+        ctx: Any, learns: bool, x: Tensor, y: Tensor, lambda_dssim: float, padding: Padding
     ) -> tuple[Tensor, ...]:
-        ctx.weights, ctx.shape = {"valid": valid, "l1_weight": l1_weight, "ssim_weight": ssim_weight}, x.shape
-        found, kept = _means(x, y, ctx.weights, offset, learns=learns)
+        ctx.shape, (found, ctx.weights, kept) = x.shape, _means(x, y, lambda_dssim, padding, learns=learns)
         ctx.save_for_backward(*kept)
         ctx.mark_non_differentiable(*found[1:])
         return found
@@ -112,7 +102,7 @@ class _Photometric(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, scale: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
-        return None, _gradient(ctx.saved_tensors, ctx.weights, scale).view(ctx.shape), *[None] * 5
+        return None, _gradient(ctx.weights, ctx.saved_tensors, scale).view(ctx.shape), None, None, None
 
 
 def ssim_map(x: Tensor, y: Tensor, padding: Padding = "same") -> Tensor:
@@ -134,9 +124,8 @@ def ssim_map(x: Tensor, y: Tensor, padding: Padding = "same") -> Tensor:
     return similarity
 
 
-def _fused(x: Tensor, y: Tensor) -> Callable[..., tuple[Tensor, Tensor, Tensor]] | None:
-    """Return the fused loss that takes these images; None: torch operations do."""
+def _has_kernel(x: Tensor, y: Tensor) -> bool:
+    """Whether the fused loss takes these images; else torch operations do."""
     if x.dtype != torch.float32 or y.requires_grad:
-        return None
-    fused = TRAINING.has_cuda() if x.is_cuda else x.device.type == "cpu" and TRAINING.try_load()
-    return functools.partial(_Photometric.apply, torch.is_grad_enabled() and x.requires_grad) if fused else None
+        return False
+    return TRAINING.has_cuda() if x.is_cuda else x.device.type == "cpu" and TRAINING.try_load()

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.api import SH, Feature, GaussianInputs, GaussianModel, LossPack, RasterOptions, RenderResult
-from splatwizard_native import activated, activation_gradients, photometric_gradient
+from splatwizard_native import photometric_gradient
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Camera, Rasterizer, SplatModel, TrainingState, View
@@ -71,7 +71,7 @@ class WholeStep:
         sh = SH(dc=params["sh_dc"], rest=sh_rest if sh_rest.shape[1] else None, active_degree=model.active_sh_degree)
         options = asked()
         with torch.no_grad():
-            scales, opacities = activated(params["log_scales"], params["opacity_logits"])
+            scales, opacities = model.scales, model.opacities
             g = GaussianInputs(params["means"], opacities, scales, params["quats"], sh=sh)
             found = self._drawer(state.rasterizer, g, options)
             if found is None:
@@ -81,10 +81,9 @@ class WholeStep:
             if loss is None:
                 return None
             total, l1, similarity, by_image = loss
-            by: dict[str, Tensor | None] = {**gradients(by_image)}
-            by["log_scales"], by["opacity_logits"] = activation_gradients(
-                scales, opacities, by["scales"], by["opacities"]
-            )
+            by = gradients(by_image)
+            by["log_scales"] = by["scales"].mul_(scales)
+            by["opacity_logits"] = torch.ops.aten.sigmoid_backward(by["opacities"], opacities)
         for name, param in params.items():
             param.grad = by.get(name)
         return result, LossPack(total, {"l1": l1, "ssim": similarity})

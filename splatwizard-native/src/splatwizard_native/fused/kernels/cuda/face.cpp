@@ -49,20 +49,6 @@ SW_OPERATION(splatwizard_training_cuda, photometric_loss_backward) {
   });
 }
 
-SW_OPERATION(splatwizard_training_cuda, activate) {
-  return guarded_on_gpu(call, [&](cudaStream_t stream) {
-    kernels::activate({call->log_scales, call->scale_count, call->logits, call->opacity_count}, call->scales,
-                      call->opacities, stream);
-  });
-}
-
-SW_OPERATION(splatwizard_training_cuda, activate_backward) {
-  return guarded_on_gpu(call, [&](cudaStream_t stream) {
-    kernels::activate_backward({call->scales, call->scale_count, call->opacities, call->opacity_count},
-                               call->by_scales, call->by_opacities, call->by_log_scales, call->by_logits, stream);
-  });
-}
-
 SW_OPERATION(splatwizard_training_cuda, adam) {
   return guarded_on_gpu(call, [&](cudaStream_t stream) {
     kernels::AdamTensor tensors[kernels::kAdamTensors];

@@ -28,34 +28,10 @@ typedef struct {
   int64_t planes, height, width;
   bool valid;
   double l1_weight, ssim_weight;
-  const float* scale;     // one number
+  const float* scale;     // or null: one number, or 1
   float* grad;            // [planes, height, width]
 } photometric_loss_backward_call;
 SW_OPERATION(splatwizard_training_cuda, photometric_loss_backward);
-
-// exp of log scales, sigmoid of opacity logits.
-typedef struct {
-  sw_head head;
-  const float* log_scales;  // `scale_count` numbers
-  const float* logits;      // `opacity_count` numbers
-  int64_t scale_count, opacity_count;
-  float* scales;
-  float* opacities;
-} activate_call;
-SW_OPERATION(splatwizard_training_cuda, activate);
-
-// Gradients by what `activate` was given, from its results and the gradients by these; a count of 0 leaves one out.
-typedef struct {
-  sw_head head;
-  const float* scales;
-  const float* opacities;
-  int64_t scale_count, opacity_count;
-  const float* by_scales;     // or null
-  const float* by_opacities;  // or null
-  float* by_log_scales;       // or null
-  float* by_logits;           // or null
-} activate_backward_call;
-SW_OPERATION(splatwizard_training_cuda, activate_backward);
 
 // One step of Adam of all, 24 in a launch; tensors start at multiples of 16 bytes.
 SW_OPERATION(splatwizard_training_cuda, adam);

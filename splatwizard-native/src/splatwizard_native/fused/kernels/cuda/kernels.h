@@ -29,7 +29,7 @@ struct PhotometricMeans {  // one number each
 };
 void photometric(const Photometric& args, const PhotometricSums& sums, const PhotometricMeans& means,
                  cudaStream_t stream);
-// grad [planes, height, width] = *scale d total / d x, from the slopes.
+// grad [planes, height, width] = *scale d total / d x, from the slopes; scale null: 1.
 void photometric_backward(const Photometric& args, const float* scale, float* grad, cudaStream_t stream);
 
 struct AdamTensor {
@@ -50,17 +50,5 @@ struct AdamTensor {
 constexpr int kAdamTensors = 24;  // of one launch
 
 void adam(AdamTensor* tensors, int count, cudaStream_t stream);
-
-// Scales and opacities, each with how many numbers they are: raw ones for `activate`, its results for the backward
-// pass. A count of zero leaves out the one or the other.
-struct Activations {
-  const float* of_scales;
-  int64_t scales;
-  const float* of_opacities;
-  int64_t opacities;
-};
-void activate(const Activations& raw, float* scales, float* opacities, cudaStream_t stream);
-void activate_backward(const Activations& activated, const float* scale_grads, const float* opacity_grads,
-                       float* log_scale_grads, float* logit_grads, cudaStream_t stream);
 
 }  // namespace splatwizard::cuda

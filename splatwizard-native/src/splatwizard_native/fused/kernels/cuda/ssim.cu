@@ -194,7 +194,7 @@ __global__ void __launch_bounds__(kThreads)
   float sums[3][kRows];
 #pragma unroll
   for (int k = 0; k < 3; ++k) blur_column(blurred[k], first_row, column, sums[k]);
-  const float factor = *scale;
+  const float factor = scale == nullptr ? 1.f : *scale;
 #pragma unroll
   for (int j = 0; j < kRows; ++j) {
     const int y = at.y0 + first_row + j;
