@@ -1,7 +1,5 @@
 """Errors of native modules; each message says what is wrong and what to do."""
 
-from __future__ import annotations
-
 import re
 
 MAX_WORD, MAX_MESSAGE = 1000, 8000

@@ -1,7 +1,5 @@
 """Settings from the environment: the cache folder, the switches, and the longest wait for another process."""
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path

@@ -4,8 +4,6 @@ Modules are loaded by whoever first calls one, in the middle of a training, an e
 depends on what an earlier command has compiled, so it is no part of the time of any of them.
 """
 
-from __future__ import annotations
-
 import contextlib
 import time
 from collections.abc import Iterator

@@ -6,8 +6,6 @@ then hands out no gradient for this parameter; what nobody has taken is done as 
 makes the whole gradient, and where nobody looks at it before the optimizer's turn: the offerer's to know.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from torch import Tensor
