@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import re
+import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -11,6 +14,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
 
+import build_cuda_wheel  # noqa: E402
 import build_wheels  # noqa: E402
 
 from splatwizard_native import Toolchain  # noqa: E402
@@ -54,3 +58,32 @@ def test_zig_is_told_of_cpus_by_its_own_names_and_its_target_is_part_of_its_vers
     assert tools.version().endswith(" c++ -target x86_64-linux-gnu.2.17")
     monkeypatch.setenv("CXX", sys.executable)
     assert type(build_wheels.toolchain()) is Toolchain
+
+
+def test_the_distribution_of_cuda_kernels_pins_what_it_was_built_from(tmp_path):
+    found = list(build_cuda_wheel.modules())
+    of_torch = {"sw_codecs_cuda", "sw_anchors_cuda", "sw_hac_cuda"}
+    with_kernels = {
+        module.cuda.name for package in WITH_KERNELS for module in build_wheels.declared(package) if module.cuda
+    }
+    assert {module.name for _, module in found} == with_kernels - of_torch
+    versions = {package.name: build_cuda_wheel.version_of(package) for package, _ in found}
+    for name, content in (("a.so", b"library"), ("a.json", b"{}")):
+        (tmp_path / name).write_bytes(content)
+    wheel = build_cuda_wheel.write_wheel([tmp_path / "a.so"], 13, versions, "manylinux_2_17_x86_64", tmp_path)
+    assert wheel.name == f"splatwizard_cuda13-{versions['sw-rasterizers']}-py3-none-manylinux_2_17_x86_64.whl"
+    installed = tmp_path / "site"
+    pip = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-index", "--target", installed, wheel]
+    subprocess.run(pip, check=True)
+    assert (installed / "splatwizard_cuda13" / "prebuilt" / "a.so").read_bytes() == b"library"
+    (distribution,) = importlib.metadata.distributions(path=[str(installed)])
+    assert distribution.requires == [f"{name}=={version}" for name, version in sorted(versions.items())]
+    with zipfile.ZipFile(wheel) as inside:
+        assert {info.date_time[:3] for info in inside.infolist()} == {(2020, 1, 1)}
+
+
+def test_only_gpus_that_a_compiler_knows_are_asked_for(tmp_path):
+    nvcc = tmp_path / "nvcc"
+    nvcc.write_text("#!/bin/sh\necho compute_75 compute_80 compute_86 compute_89 compute_90 compute_90a\n")
+    nvcc.chmod(0o755)
+    assert build_cuda_wheel.offered(str(nvcc)) == ["7.5", "8.0", "8.6", "8.9", "9.0+PTX"]

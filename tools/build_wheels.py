@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).resolve().parents[1]
 DECLARES = re.compile(r"^(\w+) = NativeModule\(", re.MULTILINE)
+Module = Any
+"""A `splatwizard_native.NativeModule`, which is imported once its folder is on the path."""
 EPOCH = "1577836800"  # 2020-01-01: zip files know no time before 1980, and hatchling takes one
 
 
@@ -48,25 +50,38 @@ def packages(names: Sequence[str]) -> list[Path]:
     return [folder for folder in found if not names or folder.name in names]
 
 
-def compiled(package: Path, machine: str, into: Path) -> Iterator[Path]:
-    """Compile the modules with a plain C face of a package; put each into its place below `into`, a folder like src."""
+def declared(package: Path) -> Iterator[Module]:
+    """The native modules with a plain C face of a package, which has to be on the path."""
     from splatwizard_native import NativeModule
 
     for path in sorted((package / "src").rglob("*.py")):
         for name in DECLARES.findall(path.read_text(encoding="utf-8")):
             relative = path.relative_to(package / "src")
             module = getattr(importlib.import_module(".".join(relative.with_suffix("").parts)), name)
-            if not isinstance(module, NativeModule) or not module.face or module.cuda_sources:
-                continue
-            tools = toolchain()
-            with tempfile.TemporaryDirectory() as scratch:
-                built = module.build(march=machine, folder=Path(scratch), tools=tools)
-                place = into / Path(*module.package.split(".")) / "prebuilt" / module.prebuilt_name("portable")
-                place.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(built, place)
-            facts = {"sha256": hashlib.sha256(place.read_bytes()).hexdigest(), "compiler": tools.version()}
-            place.with_suffix(".json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
-            yield place
+            if isinstance(module, NativeModule) and module.face:
+                yield module
+
+
+def placed(module: Module, machine: str, folder: Path) -> Path:
+    """Compile a module into a `prebuilt` folder, with the facts beside it that the loader looks for."""
+    with tempfile.TemporaryDirectory() as scratch:
+        tools = toolchain()
+        built = module.build(march=machine, folder=Path(scratch), tools=tools)
+        told = json.loads(built.with_suffix(".json").read_text(encoding="utf-8"))
+        place = folder / module.prebuilt_name("portable")
+        place.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(built, place)
+    facts = {"sha256": hashlib.sha256(place.read_bytes()).hexdigest(), "compiler": tools.version()}
+    facts |= {"architectures": told["architectures"]} if told["architectures"] else {}
+    place.with_suffix(".json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
+    return place
+
+
+def compiled(package: Path, machine: str, into: Path) -> Iterator[Path]:
+    """Compile the modules of a package for the CPU; put each into its place below `into`, a folder like src."""
+    for module in declared(package):
+        if not module.cuda_sources:
+            yield placed(module, machine, into / Path(*module.package.split(".")) / "prebuilt")
 
 
 def toolchain() -> Toolchain:

@@ -44,11 +44,11 @@ def test_cuda_sources_are_compiled_for_each_architecture(package, monkeypatch, t
     monkeypatch.setattr(torch.version, "cuda", torch.version.cuda or "13.0")
     monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "9.0")
     before = module.key("native")
-    monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "8.0 9.0")
+    monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "8.0 9.0+PTX")
     assert module.state()["target"] == "cuda"
     assert module.key("native") != before
     (job,) = [job for job in module._jobs("native", tmp_path) if job.cuda]
-    assert {"-gencode=arch=compute_80,code=sm_80", "-gencode=arch=compute_90,code=sm_90"} <= set(job.flags)
+    assert {"-gencode=arch=compute_80,code=sm_80", "-gencode=arch=compute_90,code=compute_90"} <= set(job.flags)
     toolchain.Toolchain().compile([job], tmp_path / "log")
     assert job.output.stat().st_size > 0
     assert (package.folder / "value.h") in toolchain.read_dependencies(Path(f"{job.output}.d"))
@@ -138,17 +138,22 @@ def test_a_face_for_gpus_is_built_without_torch_and_tells_cudas_errors(package, 
 
 
 @needs_compiler
-def test_a_packaged_cuda_library_is_used_without_a_cuda_compiler_if_it_fits_the_gpu(package, monkeypatch):
+def test_a_distributed_cuda_library_is_used_without_a_cuda_compiler_if_it_fits_the_gpu(package, monkeypatch, tmp_path):
+    """It lies in the distribution for the CUDA of torch; one of another version of the sources has another name."""
     import torch
 
+    package.write("face.h", GPU_FACE)
     package.write("fill.cu", CUDA_KERNEL)
-    module = package.module(cuda_sources=("fill.cu",))
+    module = package.module(cuda_sources=("fill.cu",), face="face.h")
     monkeypatch.setattr(torch.version, "cuda", "13.0")
     monkeypatch.setattr(cuda_toolkit, "find_nvcc", lambda: None)
-    library = module._library(module.prebuilt_folder, "portable")
-    library.parent.mkdir()
+    shipped = tmp_path / "shipped" / "splatwizard_cuda13" / "prebuilt"
+    shipped.mkdir(parents=True)
+    (shipped.parent / "__init__.py").write_text("")
+    monkeypatch.syspath_prepend(str(tmp_path / "shipped"))
+    library = shipped / module.prebuilt_name("portable")
     library.write_bytes(b"not looked into")
-    facts = {"sha256": digest_of(library), "architectures": ["8.0", "9.0", "12.0a"]}
+    facts = {"sha256": digest_of(library), "architectures": ["8.0", "9.0", "12.0a", "12.5+PTX"]}
     library.with_suffix(".json").write_text(json.dumps(facts))
     for gpu, suits in (
         ((9, 0), True),
@@ -157,7 +162,12 @@ def test_a_packaged_cuda_library_is_used_without_a_cuda_compiler_if_it_fits_the_
         ((10, 0), False),
         ((12, 0), True),
         ((12, 1), False),
+        ((12, 8), True),
+        ((13, 0), True),
     ):
         monkeypatch.setattr(cuda_toolkit, "gpus", lambda gpu=gpu: [gpu])
         assert (library in module._existing()) == suits
         assert (module.available() is None) == suits
+    assert module.state()["state"] == "prebuilt"
+    package.write("fill.cu", CUDA_KERNEL + "// changed\n")
+    assert not list(module._existing())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import importlib.util
 import os
 import re
 import shutil
@@ -11,7 +12,7 @@ from pathlib import Path
 
 from splatwizard_native.errors import NativeBuildError
 
-ARCHITECTURE = re.compile(r"(\d+)\.(\d)([af]?)")
+ARCHITECTURE = re.compile(r"(\d+)\.(\d)([af]?)(\+PTX)?")
 
 
 def find_nvcc() -> str | None:
@@ -39,6 +40,14 @@ def root_of(nvcc: str) -> Path:
     beside = Path(nvcc).resolve().parent.parent
     homes = [beside, Path("/usr/local/cuda")]
     return next((home for home in homes if (home / "include" / "cuda_runtime.h").is_file()), beside)
+
+
+def distributed() -> list[Path]:
+    """Folders of the libraries that `splatwizard-cudaN` brings, N the major version of torch's CUDA; or none."""
+    import torch
+
+    spec = importlib.util.find_spec(f"splatwizard_cuda{(torch.version.cuda or '').partition('.')[0]}")
+    return [Path(folder) / "prebuilt" for folder in (spec and spec.submodule_search_locations) or ()]
 
 
 def toolkit_mismatch() -> str | None:
@@ -70,7 +79,7 @@ def architectures() -> list[str]:
     """Compute capabilities to compile for: $TORCH_CUDA_ARCH_LIST, else those of the GPUs here, else 8.0 and 9.0."""
     listed = os.environ.get("TORCH_CUDA_ARCH_LIST", "")
     if listed:
-        asked = sorted(a.removesuffix("+PTX") for a in re.split(r"[ ;,]+", listed) if a)
+        asked = sorted(a for a in re.split(r"[ ;,]+", listed) if a)
         for a in asked:
             if not ARCHITECTURE.fullmatch(a):
                 raise NativeBuildError(f"$TORCH_CUDA_ARCH_LIST names '{a}': give compute capabilities, as 8.0;9.0")
@@ -79,12 +88,12 @@ def architectures() -> list[str]:
 
 
 def runs_on(architecture: str, gpu: tuple[int, int]) -> bool:
-    """Whether machine code runs there: of "8.0" on 8.0 and any later 8.x, of "9.0a" on 9.0 alone."""
+    """Whether code runs there: of "8.0" on 8.0 and any later 8.x, of "9.0a" on 9.0 alone, of "8.0+PTX" on all later."""
     found = ARCHITECTURE.fullmatch(architecture)
     if found is None:
         return False
-    major, minor = int(found[1]), int(found[2])
-    return gpu == (major, minor) if found[3] else gpu[0] == major and gpu[1] >= minor
+    own = int(found[1]), int(found[2])
+    return gpu == own if found[3] else gpu >= own and (found[4] is not None or gpu[0] == own[0])
 
 
 def gpus() -> list[tuple[int, int]]:

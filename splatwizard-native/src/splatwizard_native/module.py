@@ -188,7 +188,7 @@ class NativeModule:
         """
         path = self._session.loaded or next(self._existing(), None)
         if path is not None:
-            state = "prebuilt" if path.parent == self.prebuilt_folder else "built"
+            state = "built" if path.parent == self.cache_folder else "prebuilt"
         else:
             state = "damaged" if any(library.exists() for library in self._places()) else "reference"
         target = "cuda" if self.cuda_sources else "cpu"
@@ -304,15 +304,16 @@ class NativeModule:
 
     def _places(self) -> Iterator[Path]:
         """Places of a library for this machine and these sources, best first."""
-        for folder, march in itertools.product((self.prebuilt_folder, self.cache_folder), MARCHES):
+        shipped = cuda_toolkit.distributed() if self.face and self.cuda_sources else []
+        for folder, march in itertools.product((*shipped, self.prebuilt_folder, self.cache_folder), MARCHES):
             yield self._library(folder, march)
 
     def prebuilt_name(self, march: str) -> str:
-        """File name in a package of a library with a face: the wheel around it tells for which machine."""
+        """File name in a wheel of a library with a face: the wheel tells for which machine."""
         return f"{self.name}-{march}-{self.source_hash()}.so"
 
     def _library(self, folder: Path, march: str) -> Path:
-        if self.face and folder == self.prebuilt_folder:
+        if self.face and folder.name == "prebuilt":
             return folder / self.prebuilt_name(march)
         return folder / f"{self.name}-{self.key(march, any_gpu=folder == self.prebuilt_folder)}.so"
 
@@ -329,9 +330,9 @@ class NativeModule:
         shared = sorted(toolchain.SHARED_INCLUDE.rglob("*.h"))
         return [*(root / s for s in (*self.sources, *self.kernels, *self.cuda_sources)), *headers, *shared]
 
-    def _find_compilers(self) -> None:
-        """Raise NativeBuildError where a compiler that this module needs is not there."""
-        if self.cuda_sources and (missing := cuda_toolkit.toolkit_mismatch()) is not None:
+    def _find_compilers(self, *, for_torch: bool = True) -> None:
+        """Raise NativeBuildError where a compiler that this module needs is not there, for this torch or for any."""
+        if self.cuda_sources and for_torch and (missing := cuda_toolkit.toolkit_mismatch()) is not None:
             raise NativeBuildError(missing)
         toolchain.find_compiler()
 
@@ -363,8 +364,9 @@ class NativeModule:
             kernel = (*shared, *include, *self.cflags, *flags, f"-DSW_ARCH={arch}")
             jobs += [Job(root / s, objects / f"{arch}-{i}.o", kernel) for i, s in enumerate(self.kernels)]
         if cuda:
-            plain = [a.replace(".", "") for a in cuda_toolkit.architectures()]
-            gencode = [f"-gencode=arch=compute_{a},code=sm_{a}" for a in plain]
+            asked = [a.replace(".", "").partition("+") for a in cuda_toolkit.architectures()]
+            code = [(a, kind) for a, ptx, _ in asked for kind in (("sm", "compute") if ptx else ("sm",))]
+            gencode = [f"-gencode=arch=compute_{a},code={kind}_{a}" for a, kind in code]
             flags = ("-std=c++20", "-O3", "-Xcompiler", "-fPIC", "-DSW_WITH_CUDA", *gencode, *include)
             jobs += [Job(root / s, objects / f"cuda-{i}.o", flags, cuda=True) for i, s in enumerate(self.cuda_sources)]
         return jobs
@@ -380,7 +382,7 @@ class NativeModule:
         return places
 
     def _compile(self, library: Path, march: str, tools: Toolchain, say: Say, force: bool) -> None:
-        self._find_compilers()
+        self._find_compilers(for_torch=not self.face or march == "native")
         say(f"compiling kernels '{self.name}' (once) ...")
         started, cuda = time.monotonic(), bool(self.cuda_sources)
         build_log = library.with_suffix(".log")
