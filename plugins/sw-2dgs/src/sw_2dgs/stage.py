@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -10,14 +11,14 @@ from sw_gaussians.stage import ThreeDGSStage
 from sw_gaussians.surface_losses import add_surface_losses, maps_for
 from sw_gaussians.surfels import Surface, SurfelModel
 
-from splatwizard_core.api import ConfigError, RasterOptions
+from splatwizard_core.api import ConfigError, DensityControl, RasterOptions
 from sw_2dgs.datasets import OTHER, surface_of
 
 if TYPE_CHECKING:
     from sw_gaussians.pictures import PictureSizes
     from torch import Tensor
 
-    from splatwizard_core.api import DensityControl, LossPack, RenderResult, SplatModel, StageContext, View
+    from splatwizard_core.api import Camera, LossPack, RenderResult, SplatModel, StageContext, TrainingState, View
     from sw_2dgs.config import TwoDGSConfig
 
 log = logging.getLogger(__name__)
@@ -71,8 +72,19 @@ class TwoDGSStage(ThreeDGSStage):
             kept = self._drawn[distortion, normals] = replace(plain, **maps)
         return kept
 
+    def whole_step(
+        self, state: TrainingState, view: View, camera: Camera, background: Tensor
+    ) -> tuple[RenderResult, LossPack] | None:
+        if type(self) is not TwoDGSStage or type(self.control).regularised is not DensityControl.regularised:
+            return None
+        terms = functools.partial(self.with_surface, view=view, step=state.step)
+        return self.step_in_one(state, view, camera, background, terms)
+
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
-        pack = super().loss(model, view, result, background, step)
+        return self.with_surface(super().loss(model, view, result, background, step), result, view=view, step=step)
+
+    def with_surface(self, pack: LossPack, result: RenderResult, *, view: View, step: int) -> LossPack:
+        """Return the loss plus the surface losses of this step."""
         distortion, normals = self.weights(step)
         return add_surface_losses(
             pack, result, view.camera, self.surface.depth_ratio,

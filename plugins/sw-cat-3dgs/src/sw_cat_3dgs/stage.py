@@ -151,9 +151,12 @@ class CatStage(CodedAnchorStage):
         numbers = model.num_rows * sum(model.context.shape.widths)
         return model.plane_bits(self.opt.rate_term.triplane_sample) / numbers
 
+    def learns_pictures(self, model: Any) -> bool:
+        return model.trained not in ("spatial models", "nothing")
+
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
         assert isinstance(model, CatAnchors)
-        if model.trained not in ("spatial models", "nothing"):
+        if self.learns_pictures(model):
             return super().loss(model, view, result, background, step)
         # A leaf of its own, so that there is a derivative to take where nothing learns.
         total = result.image.new_zeros((), requires_grad=True)

@@ -22,7 +22,7 @@ from sw_gaussians.adam_moments import keep_moments
 from sw_gaussians.averaging import average_of_the_end
 from sw_gaussians.control_tasks import control_task
 from sw_gaussians.fast.fused_adam import FusingOptimizer, offer_updates
-from sw_gaussians.fast.whole_step import WholeStep
+from sw_gaussians.fast.whole_step import Terms, WholeStep
 from sw_gaussians.late_batches import LAST_PRIORITY, SumViews
 from sw_gaussians.learning_rate import exponential_lr
 from sw_gaussians.pictures import PictureSizes, Rounds
@@ -239,8 +239,14 @@ class ThreeDGSStage(Stage):
     ) -> tuple[RenderResult, LossPack] | None:
         if type(self) is not ThreeDGSStage or type(self.control).regularised is not DensityControl.regularised:
             return None
+        return self.step_in_one(state, view, camera, background)
+
+    def step_in_one(
+        self, state: TrainingState, view: View, camera: Camera, background: Tensor, terms: Terms | None = None
+    ) -> tuple[RenderResult, LossPack] | None:
+        """Do what `whole_step` says, with these further terms of the maps; without those of the density control."""
         options = functools.partial(self.raster_options, state.step, background)
-        return self._whole(options, self.config.loss, state, view, camera, background)
+        return self._whole(options, self.config.loss, state, view, camera, background, terms)
 
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
         truth, settings = view.image(background, result.image.device), self.config.loss

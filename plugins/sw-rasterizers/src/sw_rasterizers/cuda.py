@@ -84,7 +84,7 @@ def check() -> None:
 
 
 Again = dict[str, Repeated]
-"""Operations of drawings that are alike: of one size, with one background, of tensors of one form."""
+"""Operations of drawings that are alike: of one size, with one background, of tensors that differ in rows alone."""
 
 
 def again() -> Again:
@@ -116,8 +116,7 @@ def draw(picture: Picture, tensors: Tensors, again: Again | None = None) -> Draw
     splats, seconds, camera = None, 0.0, tuple(call.camera)
 
     def fixed() -> dict[str, Any]:
-        return {"geom_indices": call.geom_indices, "visible": call.visible, "count": count, "device": device,
-                **picture.settings()}  # fmt: skip
+        return {"geom_indices": call.geom_indices, "visible": call.visible, "device": device, **picture.settings()}
 
     while True:
         sizes = _plan(device, count, splat_room, room, *picture.size, picture.channels, picture.colors, flags)
@@ -129,10 +128,10 @@ def draw(picture: Picture, tensors: Tensors, again: Again | None = None) -> Draw
         # What is made here fits: addresses spare its checks, each as long as making it.
         render = _once(cuda_face.render) if again is None else again["render"]
         found = render(
-            fixed, **{name: x for name, x in tensors.items() if x is not None}, camera=camera, projected=projected,
-            mailbox=_MAILBOXES.address(device), splats=splats.data_ptr(), splat_bytes=splats.numel(),
-            scratch=scratch.data_ptr(), scratch_bytes=scratch.numel(), lists=lists.data_ptr(),
-            list_bytes=lists.numel(), first=pair_splats[0].data_ptr(), second=pair_splats[1].data_ptr(), room=room,
+            fixed, **_rows(count, again), **{name: x for name, x in tensors.items() if x is not None}, camera=camera,
+            projected=projected, mailbox=_MAILBOXES.address(device), splats=splats.data_ptr(),
+            splat_bytes=splats.numel(), scratch=scratch.data_ptr(), scratch_bytes=scratch.numel(),
+            lists=lists.data_ptr(), list_bytes=lists.numel(), first=pair_splats[0].data_ptr(), second=pair_splats[1].data_ptr(), room=room,
             splat_room=splat_room, radii=radii.data_ptr(), drawn=_at(drawn), image=_at(None if as_bytes else image),
             levels=_at(image if as_bytes else None), alpha=_at(alpha), median=_at(median), maps=_at(maps),
         )  # fmt: skip
@@ -142,8 +141,8 @@ def draw(picture: Picture, tensors: Tensors, again: Again | None = None) -> Draw
                 f"sw_rasterizers: {found.pairs} splat-tile pairs are more than {most}: draw fewer Gaussians or a "
                 f"smaller image, or set {LIMIT} (12 to 20 bytes each)"
             )
-        _Recent.splats = max(found.used, _Recent.splats - _Recent.splats // 64)
-        _Recent.pairs = max(found.pairs, _Recent.pairs - _Recent.pairs // 64)
+        _Recent.splats = max(found.used, _Recent.splats - _Recent.splats // 1024)
+        _Recent.pairs = max(found.pairs, _Recent.pairs - _Recent.pairs // 1024)
         if found.complete:
             break
         splat_room, room = min(count, _rounded(found.used)), min(most, _rounded(found.pairs))
@@ -183,7 +182,7 @@ def blend_backward(picture: Picture, count: int, kept: Kept, by: Tensors, again:
         return {**{name: x for name, x in picture.settings().items() if name not in unwanted}, **more}
 
     found = (_once(cuda_face.blend_backward) if again is None else again["blend_backward"])(
-        fixed, **{f"by_{name}": x for name, x in by.items() if x is not None}, camera=tuple(picture.call.camera),
+        fixed, **{f"by_{name}": x for name, x in by.items()}, camera=tuple(picture.call.camera),
         lists=kept.lists.data_ptr(), list_bytes=kept.lists.numel(), pair_splats=kept.pair_splats.data_ptr(),
         room=kept.pair_splats.numel(), **kept.sizes, scratch=_at(scratch),
         scratch_bytes=0 if scratch is None else scratch.numel(), rows=rows.data_ptr(), count=count, row_length=length,
@@ -224,8 +223,9 @@ def project_backward(
         return {**settings, **more, **_adam("dc", done.get("sh_dc")), **_adam("rest", done.get("sh_rest"))}
 
     found = (_once(cuda_face.project_backward) if again is None or done else again["project_backward"])(
-        fixed, **{name: x for name, x in tensors.items() if x is not None}, camera=tuple(call.camera), drawn=drawn,
-        rows=rows, maps=maps, **{f"of_{name}": x.data_ptr() for name, x in made.items()},
+        fixed, **_rows(len(means), again), **{name: x for name, x in tensors.items() if x is not None},
+        camera=tuple(call.camera), drawn=drawn, rows=rows, maps=maps,
+        **{f"of_{name}": x.data_ptr() for name, x in made.items()},
     )  # fmt: skip
     # Whoever offered an update sees by the version that it is done: of what was drawn, since the update may name an
     # alias that counts on its own, as `param.data` does.
@@ -263,6 +263,11 @@ def visible_radii(call: Call, geometry: Tensors) -> Tensor:
 def _once(operation: Callable[..., Any]) -> Callable[..., Any]:
     """Return an operation as something that is called as `Repeated` is."""
     return lambda fixed, **changed: operation(**fixed(), **changed)
+
+
+def _rows(count: int, again: Again | None) -> dict[str, int]:
+    """Return the counts of Gaussians and shapes, which may change where calls are else alike."""
+    return {"count": count} if again is None else {"count": count, "shapes": count}
 
 
 def _at(tensor: Tensor | None) -> int | None:

@@ -13,8 +13,6 @@ from splatwizard_native import AdamUpdate, offered_update
 from sw_rasterizers import cpu, cuda
 from sw_rasterizers.call import INPUTS, Call, Flag, camera_numbers
 
-Drawing = tuple[Tensor, Tensor, "Tensor | None", "Tensor | None"]
-Gradients = Callable[[Tensor], dict[str, Tensor]]
 UPDATED = ("sh_dc", "sh_rest")
 """Inputs for which the backward pass on CUDA can do Adam's step (`splatwizard_native.offer_update`)."""
 
@@ -90,7 +88,7 @@ class _RasterizeOnCuda(torch.autograd.Function):
         kept = ctx.kept if _KEEPS_GRAPH() else [ctx.kept.pop()]
         ctx.updates = {}
         by = {"image": image, "alpha": alpha, "median": median}
-        found = _gradients_on_cuda(picture, tensors, [*kept], by, wanted, updates)
+        found = gradients_on_cuda(picture, tensors, [*kept], by, wanted, updates)
         return None, None, None, *map(found.get, INPUTS)
 
 
@@ -98,7 +96,7 @@ _KEEPS_GRAPH: Callable[[], bool] = getattr(torch._C._autograd, "_get_current_gra
 """Whether a backward pass under way may be followed by another one through the same nodes."""
 
 
-def _gradients_on_cuda(
+def gradients_on_cuda(
     picture: cpu.Picture, tensors: cpu.Tensors, kept: list[Any], by: cpu.Tensors, wanted: set[str],
     updates: dict[str, AdamUpdate], again: cuda.Again | None = None,
 ) -> dict[str, Tensor]:  # fmt: skip
@@ -107,14 +105,15 @@ def _gradients_on_cuda(
     statistics = {"grad2d": call.grad2d, "absgrad2d": call.absgrad2d}
     wanted = wanted | {name for name, buffer in statistics.items() if buffer is not None}
     rows = cuda.blend_backward(picture, len(means), kept.pop(), by, again)
-    found = cuda.project_backward(picture, tensors, shown, rows, wanted, updates, again=again)
+    maps = by.get("maps") is not None
+    found = cuda.project_backward(picture, tensors, shown, rows, wanted, updates, maps=maps, again=again)
     for name, buffer in statistics.items():
         if buffer is not None:
             buffer.set(found[name])
     return found
 
 
-def _updates(tensors: dict[str, Tensor | None]) -> dict[str, AdamUpdate]:
+def updates_of(tensors: dict[str, Tensor | None]) -> dict[str, AdamUpdate]:
     """Return the Adam updates of sh_dc and sh_rest to fuse into the backward pass on CUDA."""
     offers = {name: offered_update(x) for name in UPDATED if (x := tensors.get(name)) is not None}
     return {name: u for name, u in offers.items() if u is not None}
@@ -143,41 +142,8 @@ def rasterize(call: Call, tensors: dict[str, Tensor | None]) -> tuple[Tensor, Te
     if means.is_cuda:
         named = dict(zip(INPUTS, inputs, strict=True))
         picture = cpu.Picture(call, named, int(call.flags))
-        return _RasterizeOnCuda.apply(picture, _updates(named), dummy, *inputs)  # type: ignore[no-any-return]
+        return _RasterizeOnCuda.apply(picture, updates_of(named), dummy, *inputs)  # type: ignore[no-any-return]
     return _Rasterize.apply(call, dummy, *inputs)  # type: ignore[no-any-return]
-
-
-def draw_unrecorded(
-    call: Call, tensors: dict[str, Tensor | None], again: cuda.Again | None = None
-) -> tuple[Drawing, Gradients]:
-    """Draw one view as `rasterize` does, unknown to autograd; the second gives gradients, once, by names of INPUTS.
-
-    Of all inputs, from the gradient of the image. It fills the statistics of the call.
-
-    again   of drawings on CUDA that are like this one
-    """
-    call.flags |= Flag.SAVE
-    named = {name: None if (x := tensors.get(name)) is None else x.contiguous() for name in INPUTS}
-    means = named["means"]
-    assert means is not None
-    picture = cpu.Picture(call, named, int(call.flags))
-    updates = _updates(tensors) if means.is_cuda else {}
-    drawn: Any = cuda.draw(picture, named, again) if means.is_cuda else cpu.draw(picture, named)
-    kept = [drawn.kept]  # gone before there is room for the gradients of the inputs
-    wanted = {name for name, x in named.items() if x is not None}
-    buffers = {"grad2d": call.grad2d, "absgrad2d": call.absgrad2d}
-    statistics = {name: buffer for name, buffer in buffers.items() if buffer is not None}
-
-    def gradients(by_image: Tensor) -> dict[str, Tensor]:
-        by = {"image": by_image.contiguous(), "alpha": None, "median": None}
-        if means.is_cuda:
-            return _gradients_on_cuda(picture, named, kept, by, wanted, updates, again)
-        found = cpu.draw_backward(picture, named, kept.pop(), by, wanted | statistics.keys())
-        for name, buffer in statistics.items():
-            buffer.set(found[name])
-        return found
-
-    return drawn[:4], gradients
 
 
 def visible_radii(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,10 +22,11 @@ from splatwizard_core.api import (
     RenderResult,
     ShapeError,
 )
-from sw_rasterizers import cuda, plugin
+from sw_rasterizers import plugin
 from sw_rasterizers.call import Call, Flag, camera_numbers
-from sw_rasterizers.ops import Gradients, draw_unrecorded, rasterize, visible_radii
+from sw_rasterizers.ops import rasterize, visible_radii
 from sw_rasterizers.scoring import Totals, add_scores, check_count
+from sw_rasterizers.unrecorded import Gradients, Unrecorded
 
 CUDA_CHANNELS = 8
 """Channels blended per pass on CUDA: `kMaxChunk` of csrc/cuda/kernels.h."""
@@ -48,7 +48,7 @@ class StandardRasterizer:
 
     def __init__(self, *, count: bool = False) -> None:
         self.count = count
-        self._last: tuple[tuple[Any, ...], Call, cuda.Again] | None = None  # of `draw`: what the next may be like
+        self._unrecorded = Unrecorded(self.info)
 
     def render(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> RenderResult:
         """Render one view; see the protocol. Raises CapabilityError, ConfigError or ShapeError."""
@@ -62,25 +62,15 @@ class StandardRasterizer:
         return _result(g, cam, opt, call, *rasterize(call, _tensors(g)))
 
     def draw(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> tuple[RenderResult, Gradients]:
-        """Draw one view as `render` does, unknown to autograd; the result, and what gives its gradients.
+        """Draw one view as `render` does, unknown to autograd; see `Unrecorded.draw`. Raises as `render`."""
 
-        Those of all inputs from that of the image [C,H,W], once, by the names of `call.INPUTS`; it fills the statistics
-        that were asked for. An input with an offered update (`splatwizard_native.offer_update`) that is done then has
-        none. Raises as `render`; ConfigError for scores.
-        """
-        form = _form(g, cam, opt) if g.means.is_cuda else None
-        if form is not None and self._last is not None and self._last[0] == form:
-            _, like, again = self._last
-            call = like.repeated(camera_numbers(cam))
-        else:
-            self.info.check_request(g, opt)
-            if opt.scores or opt.fisher:
-                raise ConfigError("scores are no part of a drawing to be learned from: ask `accumulate` for them")
-            call, again = self._call(g, cam, opt, learns=True), cuda.again()
+        def call_of() -> Call:
+            call = self._call(g, cam, opt, learns=True)
             self._check(g, opt, call)
-            self._last = None if form is None else (form, call, again)
-        drawn, gradients = draw_unrecorded(call, _tensors(g), again if form is not None else None)
-        return _result(g, cam, opt, call, *drawn), gradients
+            return call
+
+        call, drawn, gradients = self._unrecorded.draw(g, cam, opt, _tensors(g), call_of)
+        return _result(g, cam, opt, call, *drawn[:4]), gradients
 
     def _check(self, g: GaussianInputs, opt: RasterOptions, call: Call) -> None:
         if g.colors is not None and g.colors.shape[1] == 0 and g.features is None and not opt.depth:
@@ -133,19 +123,6 @@ class StandardRasterizer:
             grad2d=GradBuffer() if learns and opt.grad2d else None,
             absgrad2d=GradBuffer() if learns and (opt.absgrad or opt.fragment_grad) else None,
         )
-
-
-def _form(g: GaussianInputs, cam: Camera, opt: RasterOptions) -> tuple[Any, ...] | None:
-    """Return what checks of a drawing look at; None for inputs that few trainings have."""
-    sh = g.sh
-    rare = g.cov3d, g.geom_indices, g.scale_factors, g.colors, g.features, g.visible
-    if sh is None or sh.dense is not None or sh.codebook is not None or any(x is not None for x in rare):
-        return None
-    forms = [
-        None if t is None else (t.shape, t.dtype, t.get_device(), t.is_contiguous())
-        for t in (g.means, g.opacities, g.scales, g.quats, sh.dc, sh.rest)
-    ]
-    return *forms, sh.active_degree, opt, cam.width, cam.height, torch.are_deterministic_algorithms_enabled()
 
 
 def _tensors(g: GaussianInputs) -> dict[str, Tensor | None]:

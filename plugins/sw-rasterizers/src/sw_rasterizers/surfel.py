@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -22,6 +23,7 @@ from splatwizard_core.api import (
 from sw_rasterizers import cpu, cuda, plugin
 from sw_rasterizers.call import INPUTS as INPUTS_OF_ALL
 from sw_rasterizers.call import Call, Flag, camera_numbers
+from sw_rasterizers.unrecorded import Gradients, Unrecorded
 
 INPUTS = ("means", "opacities", "scales", "quats", "sh", "sh_dc", "sh_rest", "colors")
 """Differentiable inputs."""
@@ -47,6 +49,7 @@ class SurfelRasterizer:
 
     def __init__(self, *, count: bool = False) -> None:
         self.count = count
+        self._unrecorded = Unrecorded(self.info)
 
     def render(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> RenderResult:
         """Render one view; see the protocol. Raises CapabilityError, ConfigError or ShapeError."""
@@ -55,44 +58,31 @@ class SurfelRasterizer:
             from sw_reference.surfels import warn_of_low_pass  # here: nearly nobody asks for it
 
             warn_of_low_pass(opt.eps2d)
-        call = self._call(g, cam, opt)
-        sh = g.sh
-        image, radii, alpha, maps = _draw(
-            call,
-            {
-                "means": g.means,
-                "opacities": g.opacities,
-                "scales": g.scales,
-                "quats": g.quats,
-                "sh": None if sh is None else sh.dense,
-                "sh_dc": None if sh is None else sh.dc,
-                "sh_rest": None if sh is None else sh.rest,
-                "colors": g.colors,
-            },
-        )
-        depth = {name: maps[MAPS[name]] for name in opt.depth if name != "expected"}
-        if "expected" in opt.depth:
-            depth["expected"] = maps[MAPS["accumulated"]] / alpha.clamp(min=1e-10)
-        visible, pairs, evaluated, blended, invalid = call.counts
-        return RenderResult(
-            image=image,
-            radii=radii,
-            inputs=g,
-            alpha=alpha if opt.alpha else None,
-            depth={name: depth[name] for name in sorted(opt.depth)},
-            normals=maps[MAPS["normals"]] if opt.normals else None,
-            distortion=maps[MAPS["distortion"]] if opt.distortion else None,
-            grad2d=call.grad2d,
-            stats=RasterStats(
-                n_visible=visible,
-                n_pairs=pairs,
-                n_evaluated=evaluated if evaluated >= 0 else None,
-                n_blended=blended if blended >= 0 else None,
-                n_pixels=cam.width * cam.height,
-                n_invalid=invalid,
-                stage_seconds=call.seconds,
-            ),
-        )
+        call = self._call(g, cam, opt, learns=torch.is_grad_enabled())
+        image, radii, alpha, maps = _draw(call, _tensors(g))
+        return _result(g, cam, opt, call, image, radii, alpha, _told_apart(maps, opt))
+
+    def draw(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> tuple[RenderResult, Gradients]:
+        """Draw one view as `render` does, unknown to autograd; see `Unrecorded.draw`. Raises as `render`.
+
+        Alpha and the maps of the result are leaves of autograd: gradients of theirs are taken into account.
+        """
+        make = functools.partial(self._call, g, cam, opt, learns=True)
+        call, drawn, gradients = self._unrecorded.draw(g, cam, opt, _tensors(g), make)
+        image, radii, alpha, _, maps = drawn
+        alpha = None if alpha is None else alpha.requires_grad_()
+        leaves = {name: each.detach().requires_grad_() for name, each in _told_apart(maps, opt).items()}
+
+        def with_maps(by_image: Tensor) -> dict[str, Tensor]:
+            by_maps, slopes = None, {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
+            if maps is not None and slopes:
+                by_maps = torch.zeros_like(maps, requires_grad=False)
+                for name, slope in slopes.items():
+                    by_maps[MAPS[name]] = slope
+            return gradients(by_image, None if alpha is None else alpha.grad, by_maps)
+
+        with torch.enable_grad():
+            return _result(g, cam, opt, call, image, radii, alpha, leaves), with_maps
 
     @torch.no_grad()
     def visible_filter(self, g: GaussianInputs, cam: Camera) -> Tensor:
@@ -110,9 +100,9 @@ class SurfelRasterizer:
         self.info.check_offered(Feature.asked_by(opt) | Feature.SURFEL)
         return AccumOutput({})
 
-    def _call(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> Call:
+    def _call(self, g: GaussianInputs, cam: Camera, opt: RasterOptions, *, learns: bool) -> Call:
         quirks = opt.profile == "dgr-exact"
-        flags = Flag(0)
+        flags = Flag.SURFELS
         for asked, flag in (
             (opt.clamp_color, Flag.CLAMP_COLOR),
             (not quirks, Flag.TIGHT),
@@ -135,8 +125,67 @@ class SurfelRasterizer:
             flags,
             visible=_as_bytes(g.visible),
             background=None if background is None else background.detach().contiguous(),
-            grad2d=GradBuffer() if torch.is_grad_enabled() and opt.grad2d else None,
+            grad2d=GradBuffer() if learns and opt.grad2d else None,
         )
+
+
+def _tensors(g: GaussianInputs) -> dict[str, Tensor | None]:
+    """Return the inputs by the names that the kernels have for them."""
+    sh = g.sh
+    return {
+        "means": g.means,
+        "opacities": g.opacities,
+        "scales": g.scales,
+        "quats": g.quats,
+        "sh": None if sh is None else sh.dense,
+        "sh_dc": None if sh is None else sh.dc,
+        "sh_rest": None if sh is None else sh.rest,
+        "colors": g.colors,
+    }
+
+
+def _told_apart(maps: Tensor | None, opt: RasterOptions) -> dict[str, Tensor]:
+    """Return the maps [7,H,W] that options need, each [..., H, W], by name."""
+    needed = {"accumulated" if mode == "expected" else mode for mode in opt.depth}
+    needed |= {name for name in ("normals", "distortion") if getattr(opt, name)}
+    return {} if maps is None else {name: maps[MAPS[name]] for name in sorted(needed)}
+
+
+def _result(
+    g: GaussianInputs,
+    cam: Camera,
+    opt: RasterOptions,
+    call: Call,
+    image: Tensor,
+    radii: Tensor,
+    alpha: Tensor | None,
+    maps: dict[str, Tensor],
+) -> RenderResult:
+    """Return the result of a drawing from its maps by name."""
+    depth = {name: maps[name] for name in opt.depth if name != "expected"}
+    if "expected" in opt.depth:
+        assert alpha is not None
+        depth["expected"] = maps["accumulated"] / alpha.clamp(min=1e-10)
+    visible, pairs, evaluated, blended, invalid = call.counts
+    return RenderResult(
+        image=image,
+        radii=radii,
+        inputs=g,
+        alpha=alpha if opt.alpha else None,
+        depth={name: depth[name] for name in sorted(opt.depth)},
+        normals=maps.get("normals"),
+        distortion=maps.get("distortion"),
+        grad2d=call.grad2d,
+        stats=RasterStats(
+            n_visible=visible,
+            n_pairs=pairs,
+            n_evaluated=evaluated if evaluated >= 0 else None,
+            n_blended=blended if blended >= 0 else None,
+            n_pixels=cam.width * cam.height,
+            n_invalid=invalid,
+            stage_seconds=call.seconds,
+        ),
+    )
 
 
 def _as_bytes(mask: Tensor | None) -> Tensor | None:
@@ -151,7 +200,7 @@ class _DrawSurfels(torch.autograd.Function):
         tensors = [None if x is None else x.detach().contiguous() for x in inputs]
         named = _named(tensors)
         ctx.set_materialize_grads(False)
-        ctx.picture = cpu.Picture(call, named, int(call.flags | Flag.SURFELS))
+        ctx.picture = cpu.Picture(call, named, int(call.flags))
         if named["means"].is_cuda:
             on_cuda = cuda.draw(ctx.picture, named)
             image, radii, alpha, maps, kept = on_cuda.image, on_cuda.radii, on_cuda.alpha, on_cuda.maps, on_cuda.kept

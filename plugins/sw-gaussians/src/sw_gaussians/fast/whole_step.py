@@ -1,7 +1,7 @@
-"""Drawing, loss and gradients of a training step of plain 3DGS in one, outside of autograd.
+"""Drawing, loss and gradients of a training step in one, the drawing and the photometric loss outside of autograd.
 
-The kernels, and so the numbers, are those of `GaussianModel.gaussians`, `Rasterizer.render`, `ThreeDGSStage.loss` and
-autograd: what is spared is the time of the host, more than half a millisecond a step, which a GPU would wait for.
+The kernels, and so the numbers, are those of `Rasterizer.render`, the stage's loss and autograd: what is spared is the
+time of the host, more than half a millisecond a step, which a GPU would wait for.
 """
 
 from __future__ import annotations
@@ -14,18 +14,22 @@ from torch import Tensor
 
 from splatwizard_core.api import SH, Feature, GaussianInputs, GaussianModel, LossPack, RasterOptions, RenderResult
 from splatwizard_native import photometric_gradient
+from sw_gaussians.surfels import SurfelModel
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Camera, Rasterizer, SplatModel, TrainingState, View
     from sw_gaussians.config import Loss
+
+Terms = Callable[[LossPack, RenderResult], LossPack]
+"""Adds the further terms of a loss."""
 
 
 @runtime_checkable
 class Draws(Protocol):
     """A rasterizer that draws unknown to autograd.
 
-    draw    the result, and what gives, once, from the gradient of the image those of means, opacities, scales, quats,
-            sh_dc and sh_rest, but for those whose offered update is done then
+    draw    the result, and what gives, once, from the gradient of the image those of all inputs, by name (sh_dc, ...),
+            but for those whose offered update is done then. Maps of the result are leaves, whose gradients it adds
     """
 
     def draw(
@@ -59,14 +63,18 @@ class WholeStep:
         view: View,
         camera: Camera,
         background: Tensor,
+        terms: Terms | None = None,
     ) -> tuple[RenderResult, LossPack] | None:
-        """Do what `Stage.whole_step` says, with these options and this loss; None where it cannot."""
+        """Do what `Stage.whole_step` says, with these options and this loss; None where it cannot.
+
+        terms   those of the maps: they have no gradient by what was drawn
+        """
         model = state.model
         if not is_plain(model) or not torch.is_grad_enabled():
             return None
         params: dict[str, Any] = model._parameters
         sh_rest, truth = params["sh_rest"], view.image(background, params["means"].device)
-        if truth.shape != (3, camera.height, camera.width) or truth.dtype != torch.float32 or truth.requires_grad:
+        if not _fits(truth, camera):
             return None
         sh = SH(dc=params["sh_dc"], rest=sh_rest if sh_rest.shape[1] else None, active_degree=model.active_sh_degree)
         options = asked()
@@ -81,12 +89,53 @@ class WholeStep:
             if loss is None:
                 return None
             total, l1, similarity, by_image = loss
+            pack = LossPack(total, {"l1": l1, "ssim": similarity})
+        if terms is not None:
+            pack = terms(pack, result)
+            if pack.total.requires_grad:
+                _backward((pack.total,), (None,))
+        with torch.no_grad():
             by = gradients(by_image)
             by["log_scales"] = by["scales"].mul_(scales)
             by["opacity_logits"] = torch.ops.aten.sigmoid_backward(by["opacities"], opacities)
         for name, param in params.items():
             param.grad = by.get(name)
-        return result, LossPack(total, {"l1": l1, "ssim": similarity})
+        return result, pack
+
+    def through(
+        self,
+        g: GaussianInputs,
+        options: RasterOptions,
+        lambda_dssim: float,
+        state: TrainingState,
+        view: View,
+        camera: Camera,
+        background: Tensor,
+        terms: Terms,
+    ) -> tuple[RenderResult, LossPack] | None:
+        """Do the same for Gaussians that autograd knows, with colours of their own; None where it cannot.
+
+        terms   those of what was drawn
+        """
+        truth = view.image(background, g.means.device)
+        if not _fits(truth, camera) or g.sh is not None or g.means.dtype != torch.float32:
+            return None
+        found = self._drawer(state.rasterizer, g, options)
+        if found is None:
+            return None
+        with torch.no_grad():
+            result, gradients = found[0].draw(g, camera, found[1])
+            loss = photometric_gradient(result.image, truth, lambda_dssim)
+            if loss is None:
+                return None
+            total, l1, similarity, by_image = loss
+        pack = terms(LossPack(total, {"l1": l1, "ssim": similarity}), result)
+        with torch.no_grad():
+            by = gradients(by_image)
+        learning = {name: x for name in by if (x := getattr(g, name, None)) is not None and x.requires_grad}
+        further = {"total": pack.total} if pack.total.requires_grad else {}
+        _backward((*learning.values(), *further.values()), (*map(by.get, learning), *map(by.get, further)))
+        return result, pack
 
     def _drawer(
         self, rasterizer: Rasterizer, g: GaussianInputs, opt: RasterOptions
@@ -108,8 +157,8 @@ class WholeStep:
 
 
 def is_plain(model: SplatModel) -> TypeGuard[GaussianModel]:
-    """Whether these are Gaussians of 3DGS with parameters that all learn, without gradient yet and without hooks."""
-    return type(model) is GaussianModel and all(
+    """Whether these are Gaussians or surfels with parameters that all learn, without gradient yet and without hooks."""
+    return type(model) in (GaussianModel, SurfelModel) and all(
         p is not None
         and p.requires_grad
         and p.grad is None
@@ -118,3 +167,14 @@ def is_plain(model: SplatModel) -> TypeGuard[GaussianModel]:
         and not p._backward_hooks
         for p in model._parameters.values()
     )
+
+
+def _fits(truth: Tensor, camera: Camera) -> bool:
+    return truth.shape == (3, camera.height, camera.width) and truth.dtype == torch.float32 and not truth.requires_grad
+
+
+def _backward(roots: tuple[Tensor, ...], slopes: tuple[Tensor | None, ...]) -> None:
+    """Run autograd from there, of scalars with slope 1; `torch.autograd.backward` would import sympy for the shapes."""
+    given = tuple(torch.ones_like(x) if slope is None else slope for x, slope in zip(roots, slopes, strict=True))
+    engine: Any = torch.autograd.Variable._execution_engine
+    engine.run_backward(roots, given, False, False, (), allow_unreachable=True, accumulate_grad=True)
