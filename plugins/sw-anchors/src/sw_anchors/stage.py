@@ -5,12 +5,10 @@ Source: Scaffold-GS (arXiv 2312.00109) as trained by HAC (arXiv 2403.14530); the
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import torch
-from sw_gaussians.fast.whole_step import WholeStep
 from sw_gaussians.learning_rate import exponential_lr
 from sw_gaussians.pictures import PictureSizes, Rounds
 
@@ -30,6 +28,7 @@ from sw_anchors.anchors import AnchorModel
 from sw_anchors.coded_anchors import CodedAnchors
 from sw_anchors.fast import loss as fast_loss
 from sw_anchors.fast import replay
+from sw_anchors.fast.whole_step import WholeAnchorStep
 from sw_anchors.growth import accumulate_anchor_statistics, adjust_anchors
 from sw_anchors.params import AnchorParams, CodedAnchorParams
 
@@ -37,14 +36,12 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from splatwizard_core.api import (
-        Camera,
         CameraSampler,
         OptimizationParams,
         PipelineParams,
         Scene,
         Scheduler,
         SplatModel,
-        TrainingState,
         View,
     )
 
@@ -67,9 +64,7 @@ class AnchorStage(Stage):
         """Set up for `opt`; pictures: `opt.pictures.load(plugins)`, None where their sizes do not change."""
         super().__init__(opt)
         opt.pictures.check(opt, pictures)
-        self.pictures = pictures
-        self._options: RasterOptions | None = None  # of the last step: nearly always those of the next
-        self._whole = WholeStep()
+        self.pictures, self._whole = pictures, WholeAnchorStep()
         self.extent = 1.0  # known when the stage begins; a plan can be printed without a scene
 
     def at(self, step: int) -> int:
@@ -173,9 +168,7 @@ class AnchorStage(Stage):
         return step <= self.at(self.opt.random_background_until)
 
     def raster_options(self, step: int, background: Tensor) -> RasterOptions:
-        if self._options is None or self._options.background is not background:
-            self._options = RasterOptions(background=background, grad2d=True)
-        return self._options
+        return RasterOptions(background=background, grad2d=True)
 
     def extra_loss(self, model: Any, result: RenderResult, step: int) -> Mapping[str, Weighted | Tensor]:
         """Return further loss terms by name: a scalar, or (weight, scalar), which needs fewer GPU launches."""
@@ -188,38 +181,18 @@ class AnchorStage(Stage):
         return mean(result.inputs.scales)
 
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
-        truth = view.image(background, result.image.device)
-        found = photometric_loss(result.image, truth, lambda_dssim=self.opt.loss.lambda_dssim)
-        return self.with_terms(model, step, found, result)
+        truth, weight = view.image(background, result.image.device), self.opt.loss.lambda_dssim
+        return self.with_terms(model, step, photometric_loss(result.image, truth, lambda_dssim=weight), result)
 
     def with_terms(self, model: Any, step: int, found: LossPack, result: RenderResult) -> LossPack:
         """Return the photometric loss plus the volume and the extra terms."""
-        terms = {
-            "volume": (self.opt.loss.volume, self.mean_volume(result)),
-            **self.extra_loss(model, result, step),
-        }
+        terms = {"volume": (self.opt.loss.volume, self.mean_volume(result)), **self.extra_loss(model, result, step)}
         add_up = fast_loss.weighted_sum if fast_enabled() else weighted_sum
         total, *weighted = add_up(found.total, *(t if isinstance(t, tuple) else (1.0, t) for t in terms.values()))
         return LossPack(total, found.parts | dict(zip(terms, weighted, strict=True)))
 
-    def learns_pictures(self, model: Any) -> bool:
-        """Return whether `loss` is that of this class now; whoever overrides it may say for which steps it is."""
-        return type(self).loss is AnchorStage.loss
-
-    def whole_step(
-        self, state: TrainingState, view: View, camera: Camera, background: Tensor
-    ) -> tuple[RenderResult, LossPack] | None:
-        model, step = state.model, state.step
-        if not self.learns_pictures(model):
-            return None
-        inputs, options = model.gaussians(camera, state.rasterizer), self.raster_options(step, background)
-        terms = functools.partial(self.with_terms, model, step)
-        found = self._whole.through(inputs, options, self.opt.loss.lambda_dssim, state, view, camera, background, terms)
-        if found is None:  # in parts, from what has been decoded: noise is drawn once
-            result = state.rasterizer.render(inputs, camera, options)
-            found = result, self.loss(model, view, result, background, step)
-            found[1].total.backward()  # type: ignore[no-untyped-call]
-        return found
+    def whole_step(self, state: Any, view: View, camera: Any, background: Tensor) -> Any:
+        return self._whole.of(self, state, view, camera, background) if type(self).loss is AnchorStage.loss else None
 
 
 def mean_product(scales: Tensor) -> Tensor:

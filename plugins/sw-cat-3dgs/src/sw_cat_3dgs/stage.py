@@ -34,6 +34,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+WITHOUT_PICTURES = "spatial models", "nothing"
+"""What is trained where the loss looks at no picture."""
+
 
 class CatStage(CodedAnchorStage):
     """One stage of 40,000 steps; the README says what is trained when.
@@ -151,12 +154,13 @@ class CatStage(CodedAnchorStage):
         numbers = model.num_rows * sum(model.context.shape.widths)
         return model.plane_bits(self.opt.rate_term.triplane_sample) / numbers
 
-    def learns_pictures(self, model: Any) -> bool:
-        return model.trained not in ("spatial models", "nothing")
+    def whole_step(self, state: Any, view: View, camera: Any, background: Tensor) -> Any:
+        plain = type(self).loss is CatStage.loss and state.model.trained not in WITHOUT_PICTURES
+        return self._whole.of(self, state, view, camera, background) if plain else None
 
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
         assert isinstance(model, CatAnchors)
-        if self.learns_pictures(model):
+        if model.trained not in WITHOUT_PICTURES:
             return super().loss(model, view, result, background, step)
         # A leaf of its own, so that there is a derivative to take where nothing learns.
         total = result.image.new_zeros((), requires_grad=True)

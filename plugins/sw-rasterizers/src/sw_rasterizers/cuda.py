@@ -131,9 +131,10 @@ def draw(picture: Picture, tensors: Tensors, again: Again | None = None) -> Draw
             fixed, **_rows(count, again), **{name: x for name, x in tensors.items() if x is not None}, camera=camera,
             projected=projected, mailbox=_MAILBOXES.address(device), splats=splats.data_ptr(),
             splat_bytes=splats.numel(), scratch=scratch.data_ptr(), scratch_bytes=scratch.numel(),
-            lists=lists.data_ptr(), list_bytes=lists.numel(), first=pair_splats[0].data_ptr(), second=pair_splats[1].data_ptr(), room=room,
-            splat_room=splat_room, radii=radii.data_ptr(), drawn=_at(drawn), image=_at(None if as_bytes else image),
-            levels=_at(image if as_bytes else None), alpha=_at(alpha), median=_at(median), maps=_at(maps),
+            lists=lists.data_ptr(), list_bytes=lists.numel(), first=pair_splats[0].data_ptr(),
+            second=pair_splats[1].data_ptr(), room=room, splat_room=splat_room, radii=radii.data_ptr(),
+            drawn=_at(drawn), image=_at(None if as_bytes else image), levels=_at(image if as_bytes else None),
+            alpha=_at(alpha), median=_at(median), maps=_at(maps),
         )  # fmt: skip
         seconds += found.project_seconds
         if found.pairs > most:

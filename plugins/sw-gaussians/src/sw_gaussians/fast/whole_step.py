@@ -14,7 +14,6 @@ from torch import Tensor
 
 from splatwizard_core.api import SH, Feature, GaussianInputs, GaussianModel, LossPack, RasterOptions, RenderResult
 from splatwizard_native import photometric_gradient
-from sw_gaussians.surfels import SurfelModel
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Camera, Rasterizer, SplatModel, TrainingState, View
@@ -157,16 +156,24 @@ class WholeStep:
 
 
 def is_plain(model: SplatModel) -> TypeGuard[GaussianModel]:
-    """Whether these are Gaussians or surfels with parameters that all learn, without gradient yet and without hooks."""
-    return type(model) in (GaussianModel, SurfelModel) and all(
-        p is not None
-        and p.requires_grad
-        and p.grad is None
-        and p.dtype is torch.float32
-        and p.is_contiguous()
-        and not p._backward_hooks
-        for p in model._parameters.values()
+    """Whether it is drawn as a GaussianModel, and its parameters all learn, without gradient yet and without hooks."""
+    return (
+        isinstance(model, GaussianModel)
+        and all(getattr(type(model), name) is getattr(GaussianModel, name) for name in _DRAWN)
+        and model._parameters.keys() == set(model.RAW)
+        and all(
+            p is not None
+            and p.requires_grad
+            and p.grad is None
+            and p.dtype is torch.float32
+            and p.is_contiguous()
+            and not p._backward_hooks
+            for p in model._parameters.values()
+        )
     )
+
+
+_DRAWN = "gaussians", "scales", "opacities"
 
 
 def _fits(truth: Tensor, camera: Camera) -> bool:

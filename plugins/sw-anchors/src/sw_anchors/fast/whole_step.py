@@ -1,0 +1,50 @@
+"""A training step of anchors with drawing and photometric loss outside of autograd."""
+
+from __future__ import annotations
+
+import functools
+from typing import TYPE_CHECKING, Any
+
+from sw_gaussians.fast.whole_step import WholeStep
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from splatwizard_core.api import Camera, LossPack, RasterOptions, RenderResult, TrainingState, View
+
+Step = tuple["RenderResult", "LossPack"]
+
+
+class WholeAnchorStep(WholeStep):
+    """Takes the whole step of an AnchorStage whose loss is that class's."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._kept: RasterOptions | None = None  # options of the last step, which are nearly always those of the next
+
+    def of(self, stage: Any, state: TrainingState, view: View, camera: Camera, background: Tensor) -> Step:
+        """Return the result and the loss, gradients made; in parts where nothing else can."""
+        model, step = state.model, state.step
+        inputs = model.gaussians(camera, state.rasterizer)
+        options = self._kept = _the_same(self._kept, stage.raster_options(step, background))
+        terms = functools.partial(stage.with_terms, model, step)
+        weight = stage.opt.loss.lambda_dssim
+        found = self.through(inputs, options, weight, state, view, camera, background, terms)
+        if found is not None:
+            return found
+        # From what has been decoded: noise is drawn once.
+        result = state.rasterizer.render(inputs, camera, options)
+        loss = stage.loss(model, view, result, background, step)
+        loss.total.backward()  # type: ignore[no-untyped-call]
+        return result, loss
+
+
+def _the_same(last: RasterOptions | None, now: RasterOptions) -> RasterOptions:
+    """Return the last options if they say what those of now do: what is known of them is looked up by the object."""
+    if last is not None and last.background is now.background and _said(last) == _said(now):
+        return last
+    return now
+
+
+def _said(options: RasterOptions) -> list[Any]:
+    return [value for name, value in vars(options).items() if name not in ("background", "_asked")]
