@@ -237,3 +237,30 @@ def test_a_scene_without_points_is_an_error():
     scene.points = None
     with pytest.raises(SceneError, match="has no start points"):
         TwoDGS(load_plugins(), TwoDGSConfig()).create_model(scene, torch.Generator())
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
+@pytest.mark.parametrize("ratio", [0.0, 0.5])
+def test_a_step_in_one_has_the_gradients_of_its_parts(device, ratio):
+    scene = scene_of()
+    stage = TwoDGSStage(configured(surface__dist_after=0, surface__normal_after=0, surface__depth_ratio=ratio))
+    model = begun(stage, scene, surfels_from_points(points(), generator=torch.Generator().manual_seed(0)).to(device))
+    pixels = torch.rand(3, 16, 16, generator=torch.Generator().manual_seed(1)).to(device)
+    view = SimpleNamespace(camera=scene.train[0].camera.to(device), image=lambda background, device: pixels)
+    rasterizer, black = NegotiatedRasterizer(load_plugins(), device=device), BLACK.to(device)
+    state = SimpleNamespace(model=model, rasterizer=rasterizer, step=2)
+    given = state, view, view.camera, black
+    assert stage.whole_step(*given) is None  # `render` finds out first who can draw
+
+    result = rasterizer.render(model.gaussians(view.camera, rasterizer), view.camera, stage.raster_options(2, black))
+    pack = stage.loss(model, view, result, black, 2)
+    pack.total.backward()
+    expected = {name: p.grad for name, p in model.named_parameters()}
+    model.zero_grad()
+    for _ in range(2):  # the first one is checked, the second is like it
+        found, loss = stage.whole_step(*given)
+        assert list(loss.parts) == ["l1", "ssim", "distortion", "normals"]
+        assert float(loss.total) == pytest.approx(float(pack.total), rel=1e-6)
+        torch.testing.assert_close(found.grad2d.value, result.grad2d.value)
+        torch.testing.assert_close({name: p.grad for name, p in model.named_parameters()}, expected)
+        model.zero_grad()

@@ -14,6 +14,8 @@ from sw_anchors.stage import AnchorStage, CodedAnchorStage
 from sw_gaussians.resolution import ResolutionPlan, ResolutionSampler, SmallPictures
 from sw_reference.rasterizer import ReferenceRasterizer
 
+from splatwizard_core.plugins import load_plugins
+from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
@@ -241,3 +243,29 @@ def test_statistics_between_two_adjustments_are_of_one_resolution(iterations):
     for past, now in itertools.pairwise([0, *rounds]):
         assert len({sampler.scale(step) for step in range(past + 1, now + 1)}) == 1, now
     assert len({sampler.scale(step) for step in rounds}) == len(rounds)
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
+@pytest.mark.parametrize("kind", [AnchorModel, CodedAnchors])
+def test_a_step_in_one_has_the_gradients_of_its_parts(kind, device):
+    stage = (AnchorStage if kind is AnchorModel else CodedAnchorStage)(CodedAnchorParams())
+    model = begin(stage, model_of(kind)).to(device)
+    rasterizer, black = NegotiatedRasterizer(load_plugins(), device=device), torch.zeros(3, device=device)
+    pixels = torch.rand(3, 24, 24, generator=torch.Generator().manual_seed(1)).to(device)
+    view = SimpleNamespace(image=lambda background, device: pixels)
+    for camera in [v.camera.to(device) for v in scene_of().views] * 3:
+        model.zero_grad()
+        state = SimpleNamespace(model=model, rasterizer=rasterizer, step=5)
+        result, pack = stage.whole_step(state, view, camera, black)
+        assert not result.image.requires_grad
+        found = {name: p.grad for name, p in model.named_parameters()}
+
+        model.zero_grad()
+        inputs = model.gaussians(camera, rasterizer)
+        expected = rasterizer.render(inputs, camera, stage.raster_options(5, black))
+        loss = stage.loss(model, view, expected, black, 5)
+        loss.total.backward()
+        torch.testing.assert_close(found, {name: p.grad for name, p in model.named_parameters()})
+        torch.testing.assert_close(result.grad2d.value, expected.grad2d.value)
+        assert pack.parts.keys() == loss.parts.keys()
+        assert pack.total.item() == pytest.approx(loss.total.item(), rel=1e-6)
