@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import re
+import struct
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple, NoReturn
 
@@ -85,6 +86,12 @@ def structure(name: str, fields: list[Field], *, call: bool = False) -> Any:
     return type(name, (ctypes.Structure,), {"_fields_": [*(HEAD if call else ()), *listed]})
 
 
+def _layout(fields: list[Field]) -> str:
+    """Return what the module `struct` packs a call by."""
+    kinds = [f"{f.length or ''}{'P' if f.pointer else NUMBERS[f.kind][1]._type_}" for f in fields]
+    return "".join(["@", *(kind._type_ for _, kind in HEAD), *kinds, "0P"])
+
+
 def operation(name: str, fields: list[Field], function: Any, told: Any, run: int | None, *, on_gpu: bool) -> Any:
     """Return a Python function of the fields by name, which calls `function` and returns the struct with its results.
 
@@ -110,9 +117,8 @@ def operation(name: str, fields: list[Field], function: Any, told: Any, run: int
     known = {
         "_torch": torch, "_Tensor": torch.Tensor, "_threads": torch.get_num_threads, "_addressof": ctypes.addressof,
         "_byref": ctypes.byref, "_fields": fields, "_refuse": refuse, "_function": function, "_told": told,
-        "_struct": structure(f"{name}_call", fields, call=True),
-        "_pointers": lambda field: ctypes.c_void_p * field.length,
-        "_numbers": lambda field: NUMBERS[field.kind][1] * field.length,
+        "_made": structure(f"{name}_call", fields, call=True).from_buffer_copy,
+        "_pack": struct.Struct(_layout(fields)).pack,
     }  # fmt: skip
     # As dataclasses are made: a loop over the fields took three times as long.
     exec(compile(_source(name, fields, run, on_gpu), f"<{name}>", "exec"), known)
@@ -130,7 +136,8 @@ def _source(name: str, fields: list[Field], run: int | None, on_gpu: bool) -> st
         x = field.name
         if not field.pointer:
             left_out = field.out or x in counts  # 0 if no tensor tells it
-            values.append(f"{x} or 0" if left_out else x if field.length is None else f"_numbers(_fields[{i}])(*{x})")
+            filled = f"*{x}, *(0,) * ({field.length} - len({x}))"
+            values.append(f"{x} or 0" if left_out else x if field.length is None else filled)
             continue
         # The arguments keep what they name alive until the call has returned; addresses have names of their own.
         one, at, indent = (x, f"_at_{x}", "") if field.length is None else ("_one", f"_at_{x}[_i]", "    ")
@@ -148,7 +155,7 @@ def _source(name: str, fields: list[Field], run: int | None, on_gpu: bool) -> st
                 bind += [f"    if {size} is None: {size} = {x}.shape[{k}]" for size, k in told.items()]
                 unknown -= set() if field.optional else set(told)
         if field.length is not None:
-            check += [f"_at_{x} = _pointers(_fields[{i}])()", f"for _i, _one in enumerate({x}):"]
+            check += [f"_at_{x} = [0] * {field.length}", f"for _i, _one in enumerate({x}):"]
         check += [
             f"{indent}if isinstance({one}, _Tensor):",
             *([f"{indent}    if device is None: device = {one}.get_device()"] if on_gpu else []),
@@ -158,13 +165,14 @@ def _source(name: str, fields: list[Field], run: int | None, on_gpu: bool) -> st
         if field.length is None:
             passed = f"{x} is None or type({x}) is int" if field.optional else f"type({x}) is int"
             check.append(f"else: {at} = {x} if {passed} else _addressof({x})")
-        values.append(f"_at_{x}")
+        values.append(f"_at_{x} or 0" if field.length is None else f"*_at_{x}")
     arguments = [f"{f.name}=None" if f.optional or f.out or f.name in counts else f.name for f in fields]
     # The public way to a stream makes an object of it, and takes ten times as long.
-    where = "1, device, _torch._C._cuda_getCurrentRawStream(device)" if on_gpu else "_threads(), -1, None"
+    where = "1, device, _torch._C._cuda_getCurrentRawStream(device)" if on_gpu else "_threads(), -1, 0"
     size = ctypes.sizeof(structure(name, fields, call=True))
     code = [
-        *bind, *check, f"_call = _struct({size}, {ABI}, {where}, {run}, {', '.join(values)})",
+        # As bytes: to make a struct of its values took three times as long.
+        *bind, *check, f"_call = _made(_pack({size}, {ABI}, {where}, {run or 0}, {', '.join(values)}))",
         f"if _function(_byref(_call)) != 0: raise RuntimeError(f'{name}: {{_told().decode()}}')", "return _call",
     ]  # fmt: skip
     arguments += ["device=None"] if on_gpu else []
