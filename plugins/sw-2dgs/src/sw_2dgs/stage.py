@@ -13,6 +13,7 @@ from sw_gaussians.surfels import Surface, SurfelModel
 
 from splatwizard_core.api import ConfigError, DensityControl, RasterOptions
 from sw_2dgs.datasets import OTHER, surface_of
+from sw_2dgs.surface_slopes import surface_slopes
 
 if TYPE_CHECKING:
     from sw_gaussians.pictures import PictureSizes
@@ -59,8 +60,13 @@ class TwoDGSStage(ThreeDGSStage):
 
     def weights(self, step: int) -> tuple[float, float]:
         """Return the weights of distortion and normals at a step; 0 until their steps have come."""
-        on = [step > self.steps(after) for after in (self.settings.dist_after, self.settings.normal_after)]
-        return self.surface.lambda_dist * on[0], self.surface.lambda_normal * on[1]
+        distortion, normals = self._after
+        return self.surface.lambda_dist * (step > distortion), self.surface.lambda_normal * (step > normals)
+
+    @functools.cached_property
+    def _after(self) -> tuple[int, int]:
+        """Steps of this run after which distortion and normals have weights."""
+        return self.steps(self.settings.dist_after), self.steps(self.settings.normal_after)
 
     def raster_options(self, step: int, background: Tensor) -> RasterOptions:
         """Ask for the maps of a loss only while it has a weight: without them drawing is as fast as for 3DGS."""
@@ -86,7 +92,6 @@ class TwoDGSStage(ThreeDGSStage):
     def with_surface(self, pack: LossPack, result: RenderResult, *, view: View, step: int) -> LossPack:
         """Return the loss plus the surface losses of this step."""
         distortion, normals = self.weights(step)
-        return add_surface_losses(
-            pack, result, view.camera, self.surface.depth_ratio,
-            distortion=distortion, normals=normals, term=self.settings.normal_term,
-        )  # fmt: skip
+        given, term = (pack, result, view.camera, self.surface.depth_ratio), self.settings.normal_term
+        found = surface_slopes(*given, distortion=distortion, normals=normals) if term == "code" else None
+        return found or add_surface_losses(*given, distortion=distortion, normals=normals, term=term)

@@ -68,8 +68,7 @@ def normal_disagreement(result: RenderResult, camera: Camera, depth_ratio: float
 
 def _disagreement(depth: Tensor, normals: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
     if depth.is_cuda and depth.dtype == torch.float32 and GAUSSIANS.has_cuda():
-        lens = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
-        found: Tensor = _Disagreement.apply(depth, normals, alpha, lens)  # type: ignore[no-untyped-call]
+        found: Tensor = _Disagreement.apply(depth, normals, alpha, camera)  # type: ignore[no-untyped-call]
         return found
     return disagreement_in_torch(depth, normals, alpha, camera)
 
@@ -112,23 +111,37 @@ def add_surface_losses(
     return LossPack(total, {name: part.detach() for name, part in {**loss.parts, **terms}.items()})
 
 
+def disagreement_on_gpu(depth: Tensor, normals: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
+    """Return what `disagreement_in_torch` does, unknown to autograd; all contiguous."""
+    found = torch.empty_like(depth)
+    cuda_face.disagreement(depth=depth, normals=normals, alpha=alpha, found=found, **_lens(camera))
+    return found
+
+
+def disagreement_slopes(
+    grad: Tensor, depth: Tensor, normals: Tensor, alpha: Tensor, camera: Camera
+) -> tuple[Tensor, Tensor]:
+    """Return the gradients of depth and normals from that of `disagreement_on_gpu`; all contiguous."""
+    to_depth, to_normals = torch.empty_like(depth), torch.empty_like(normals)
+    cuda_face.disagreement_backward(
+        grad=grad, depth=depth, normals=normals, alpha=alpha, to_depth=to_depth, to_normals=to_normals, **_lens(camera)
+    )
+    return to_depth, to_normals
+
+
+def _lens(camera: Camera) -> dict[str, float]:
+    return {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
+
+
 class _Disagreement(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, depth: Tensor, normals: Tensor, alpha: Tensor, lens: dict[str, float]) -> Tensor:
-        depth, normals, alpha = depth.contiguous(), normals.contiguous(), alpha.contiguous()
-        found = torch.empty_like(depth)
-        cuda_face.disagreement(depth=depth, normals=normals, alpha=alpha, found=found, **lens)
-        ctx.save_for_backward(depth, normals, alpha)
-        ctx.lens = lens
-        return found
+    def forward(ctx: Any, depth: Tensor, normals: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
+        given = depth.contiguous(), normals.contiguous(), alpha.contiguous()
+        ctx.save_for_backward(*given)
+        ctx.camera = camera
+        return disagreement_on_gpu(*given, camera)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        depth, normals, alpha = ctx.saved_tensors
-        to_depth, to_normals = torch.empty_like(depth), torch.empty_like(normals)
-        cuda_face.disagreement_backward(
-            grad=grad.contiguous(), depth=depth, normals=normals, alpha=alpha, to_depth=to_depth,
-            to_normals=to_normals, **ctx.lens,
-        )  # fmt: skip
-        return to_depth, to_normals, None, None
+        return *disagreement_slopes(grad.contiguous(), *ctx.saved_tensors, ctx.camera), None, None

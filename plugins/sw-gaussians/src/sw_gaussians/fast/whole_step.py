@@ -92,7 +92,7 @@ class WholeStep:
         if terms is not None:
             pack = terms(pack, result)
             if pack.total.requires_grad:
-                _backward((pack.total,), (None,))
+                run_backward((pack.total,), (None,))
         with torch.no_grad():
             by = gradients(by_image)
             by["log_scales"] = by["scales"].mul_(scales)
@@ -133,7 +133,7 @@ class WholeStep:
             by = gradients(by_image)
         learning = {name: x for name in by if (x := getattr(g, name, None)) is not None and x.requires_grad}
         further = {"total": pack.total} if pack.total.requires_grad else {}
-        _backward((*learning.values(), *further.values()), (*map(by.get, learning), *map(by.get, further)))
+        run_backward((*learning.values(), *further.values()), (*map(by.get, learning), *map(by.get, further)))
         return result, pack
 
     def _drawer(
@@ -180,7 +180,7 @@ def _fits(truth: Tensor, camera: Camera) -> bool:
     return truth.shape == (3, camera.height, camera.width) and truth.dtype == torch.float32 and not truth.requires_grad
 
 
-def _backward(roots: tuple[Tensor, ...], slopes: tuple[Tensor | None, ...]) -> None:
+def run_backward(roots: tuple[Tensor, ...], slopes: tuple[Tensor | None, ...]) -> None:
     """Run autograd from there, of scalars with slope 1; `torch.autograd.backward` would import sympy for the shapes."""
     given = tuple(torch.ones_like(x) if slope is None else slope for x, slope in zip(roots, slopes, strict=True))
     engine: Any = torch.autograd.Variable._execution_engine
