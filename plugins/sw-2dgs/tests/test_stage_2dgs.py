@@ -260,7 +260,7 @@ def test_a_step_in_one_has_the_gradients_of_its_parts(device, ratio):
     for _ in range(2):  # the first one is checked, the second is like it
         found, loss = stage.whole_step(*given)
         assert list(loss.parts) == ["l1", "ssim", "distortion", "normals"]
-        assert float(loss.total) == pytest.approx(float(pack.total), rel=1e-6)
+        assert loss.total.item() == pytest.approx(pack.total.item(), rel=1e-6)
         torch.testing.assert_close(found.grad2d.value, result.grad2d.value)
         torch.testing.assert_close({name: p.grad for name, p in model.named_parameters()}, expected)
         model.zero_grad()

@@ -181,15 +181,15 @@ class AnchorStage(Stage):
         return mean(result.inputs.scales)
 
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
-        truth, weight = view.image(background, result.image.device), self.opt.loss.lambda_dssim
-        return self.with_terms(model, step, photometric_loss(result.image, truth, lambda_dssim=weight), result)
-
-    def with_terms(self, model: Any, step: int, found: LossPack, result: RenderResult) -> LossPack:
-        """Return the photometric loss plus the volume and the extra terms."""
-        terms = {"volume": (self.opt.loss.volume, self.mean_volume(result)), **self.extra_loss(model, result, step)}
-        add_up = fast_loss.weighted_sum if fast_enabled() else weighted_sum
-        total, *weighted = add_up(found.total, *(t if isinstance(t, tuple) else (1.0, t) for t in terms.values()))
+        truth, terms = view.image(background, result.image.device), self.terms(model, result, step)
+        found = photometric_loss(result.image, truth, lambda_dssim=self.opt.loss.lambda_dssim)
+        total, *weighted = (fast_loss.weighted_sum if fast_enabled() else weighted_sum)(found.total, *terms.values())
         return LossPack(total, found.parts | dict(zip(terms, weighted, strict=True)))
+
+    def terms(self, model: Any, result: RenderResult, step: int) -> dict[str, Weighted]:
+        """Return the terms beside the photometric loss: the volume, and the extra ones."""
+        terms = {"volume": (self.opt.loss.volume, self.mean_volume(result)), **self.extra_loss(model, result, step)}
+        return {name: t if isinstance(t, tuple) else (1.0, t) for name, t in terms.items()}
 
     def whole_step(self, state: Any, view: View, camera: Any, background: Tensor) -> Any:
         return self._whole.of(self, state, view, camera, background) if type(self).loss is AnchorStage.loss else None

@@ -27,7 +27,7 @@ class WholeAnchorStep(WholeStep):
         model, step = state.model, state.step
         inputs = model.gaussians(camera, state.rasterizer)
         options = self._kept = _the_same(self._kept, stage.raster_options(step, background))
-        terms = functools.partial(stage.with_terms, model, step)
+        terms = functools.partial(stage.terms, model, step=step)
         weight = stage.opt.loss.lambda_dssim
         found = self.through(inputs, options, weight, state, view, camera, background, terms)
         if found is not None:

@@ -6,7 +6,7 @@ time of the host, more than half a millisecond a step, which a GPU would wait fo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, Protocol, TypeGuard, runtime_checkable
 
 import torch
@@ -53,6 +53,7 @@ class WholeStep:
     def __init__(self) -> None:
         self._asked: tuple[Rasterizer, RasterOptions] | None = None
         self._found: tuple[Draws, RasterOptions] | None = None
+        self._weights: tuple[list[float], Tensor] | None = None
 
     def __call__(
         self,
@@ -92,7 +93,7 @@ class WholeStep:
         if terms is not None:
             pack = terms(pack, result)
             if pack.total.requires_grad:
-                run_backward((pack.total,), (None,))
+                run_backward((pack.total,), (torch.ones_like(pack.total, requires_grad=False),))
         with torch.no_grad():
             by = gradients(by_image)
             by["log_scales"] = by["scales"].mul_(scales)
@@ -110,11 +111,11 @@ class WholeStep:
         view: View,
         camera: Camera,
         background: Tensor,
-        terms: Terms,
+        terms: Callable[[RenderResult], Mapping[str, tuple[float, Tensor]]],
     ) -> tuple[RenderResult, LossPack] | None:
         """Do the same for Gaussians that autograd knows, with colours of their own; None where it cannot.
 
-        terms   those of what was drawn
+        terms   weights and scalars by name, whose products the loss has besides
         """
         truth = view.image(background, g.means.device)
         if not _fits(truth, camera) or g.sh is not None or g.means.dtype != torch.float32:
@@ -128,13 +129,26 @@ class WholeStep:
             if loss is None:
                 return None
             total, l1, similarity, by_image = loss
-        pack = terms(LossPack(total, {"l1": l1, "ssim": similarity}), result)
-        with torch.no_grad():
-            by = gradients(by_image)
-        learning = {name: x for name in by if (x := getattr(g, name, None)) is not None and x.requires_grad}
-        further = {"total": pack.total} if pack.total.requires_grad else {}
-        run_backward((*learning.values(), *further.values()), (*map(by.get, learning), *map(by.get, further)))
-        return result, pack
+            by = gradients(by_image)  # the GPU works while the host puts the terms together
+        parts, further = {"l1": l1, "ssim": similarity}, terms(result)
+        weights = self._weights_of(further, total)
+        if further:
+            with torch.no_grad():
+                weighted = torch.stack([term for _, term in further.values()]) * weights
+                total = total + weighted.sum()
+            parts |= dict(zip(further, weighted.unbind(), strict=True))
+        pairs = [(x, by[name]) for name in by if (x := getattr(g, name, None)) is not None]
+        pairs += [(term, w.to(term.dtype)) for (_, term), w in zip(further.values(), weights.unbind(), strict=True)]
+        learning = [(x, slope) for x, slope in pairs if x.requires_grad]
+        run_backward(tuple(x for x, _ in learning), tuple(slope for _, slope in learning))
+        return result, LossPack(total, parts)
+
+    def _weights_of(self, terms: Mapping[str, tuple[float, Tensor]], like: Tensor) -> Tensor:
+        """Return the weights of terms in one tensor, that of the last step where they are the same."""
+        weights = [weight for weight, _ in terms.values()]
+        if self._weights is None or self._weights[0] != weights or self._weights[1].device != like.device:
+            self._weights = weights, like.new_tensor(weights)
+        return self._weights[1]
 
     def _drawer(
         self, rasterizer: Rasterizer, g: GaussianInputs, opt: RasterOptions
@@ -180,8 +194,7 @@ def _fits(truth: Tensor, camera: Camera) -> bool:
     return truth.shape == (3, camera.height, camera.width) and truth.dtype == torch.float32 and not truth.requires_grad
 
 
-def run_backward(roots: tuple[Tensor, ...], slopes: tuple[Tensor | None, ...]) -> None:
-    """Run autograd from there, of scalars with slope 1; `torch.autograd.backward` would import sympy for the shapes."""
-    given = tuple(torch.ones_like(x) if slope is None else slope for x, slope in zip(roots, slopes, strict=True))
+def run_backward(roots: tuple[Tensor, ...], slopes: tuple[Tensor, ...]) -> None:
+    """Run autograd as `torch.autograd.backward` does, which would import sympy to compare the shapes."""
     engine: Any = torch.autograd.Variable._execution_engine
-    engine.run_backward(roots, given, False, False, (), allow_unreachable=True, accumulate_grad=True)
+    engine.run_backward(roots, slopes, False, False, (), allow_unreachable=True, accumulate_grad=True)
