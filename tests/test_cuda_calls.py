@@ -402,3 +402,22 @@ def test_every_operation_is_named_here():
     for module in MODULES:
         declared = {op for owner, op in OPERATION.findall(module.face_header) if owner == module.name}
         assert not {op for op in declared if f'"{op}"' not in text}, module.name
+
+
+def test_radii_of_ellipsoids_that_are_alike_are_checked_once(drawn):
+    from splatwizard_core.api import Camera, GaussianInputs
+    from splatwizard_core.errors import CapabilityError, ShapeError
+    from sw_rasterizers.standard import StandardRasterizer
+
+    rasterizer, camera = StandardRasterizer(), Camera(32, 24, 30.0, 30.0, 16.0, 12.0, torch.eye(3), torch.ones(3))
+    for rows in (8, 5):
+        g = GaussianInputs(rand(rows, 3), rand(rows), rand(rows, 3), rand(rows, 4), colors=rand(rows, 3))
+        radii = rasterizer.visible_filter(g, camera)
+        call = drawn["visible_radii"][-1]
+        assert (call.means, call.quats, call.radii) == (g.means.data_ptr(), g.quats.data_ptr(), radii.data_ptr())
+        assert (call.count, call.shapes, len(radii), call.width) == (rows, rows, rows, 32)
+        assert (list(call.camera)[9:12], call.eps2d) == ([1, 1, 1], pytest.approx(0.3))
+    for scales in (rand(5, 2), rand(4, 3), rand(3, 5).T):
+        g.scales = scales
+        with pytest.raises((CapabilityError, ShapeError, RuntimeError)):
+            rasterizer.visible_filter(g, camera)

@@ -12,14 +12,14 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple, NoReturn
 
 ABI = 1
-HEAD = [
+HEAD: list[tuple[str, Any]] = [
     ("size", ctypes.c_uint32), ("abi", ctypes.c_uint32), ("threads", ctypes.c_int32), ("device", ctypes.c_int32),
     ("stream", ctypes.c_void_p), ("run", ctypes.c_void_p),
 ]  # fmt: skip
 STRUCT = re.compile(r"typedef struct \{\n(.*?)\} (\w+);", re.DOTALL)
 FIELD = re.compile(r"\s*(?:const )?(\w+)(\*?) ([\w, ]+)(?:\[(\d+)\])?;\s*(?://\s*(?:\[(.*?)\])?(.*))?")
 OPERATION = re.compile(r"^SW_OPERATION\((\w+), (\w+)\);", re.MULTILINE)
-NUMBERS = {
+NUMBERS: dict[str, tuple[str, Any]] = {
     "float": ("float32", ctypes.c_float), "double": ("float64", ctypes.c_double), "bool": ("bool", ctypes.c_bool),
     "int8_t": ("int8", ctypes.c_int8), "uint8_t": ("uint8", ctypes.c_uint8), "int16_t": ("int16", ctypes.c_int16),
     "uint16_t": ("int16", ctypes.c_uint16), "int32_t": ("int32", ctypes.c_int32), "int64_t": ("int64", ctypes.c_int64),

@@ -81,6 +81,9 @@ class StandardRasterizer:
     @torch.no_grad()
     def visible_filter(self, g: GaussianInputs, cam: Camera) -> Tensor:
         """Radii [N] int32 from means and covariances (opacities and colours are not looked at); 0 = culled."""
+        radii = self._unrecorded.radii(g, cam)
+        if radii is not None:
+            return radii
         self.info.check_geometry(g)
         return visible_radii(
             g.means, g.scales, g.quats, g.cov3d, _as_bytes(g.visible), cam,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
@@ -9,9 +10,10 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.api import Camera, ConfigError, GaussianInputs, RasterizerInfo, RasterOptions
-from sw_rasterizers import cpu, cuda
+from sw_rasterizers import cpu, cuda, cuda_face
 from sw_rasterizers.call import INPUTS, Call, Flag, camera_numbers
 from sw_rasterizers.ops import gradients_on_cuda, updates_of
+from sw_rasterizers.repeated import Repeated
 
 Drawing = tuple[Tensor, Tensor, "Tensor | None", "Tensor | None", "Tensor | None"]
 """Image, radii, and where they were asked for alpha, median depth, maps of surfels."""
@@ -31,12 +33,20 @@ class _Last(NamedTuple):
     again: cuda.Again
 
 
+class _Kept(threading.local):
+    """What a thread did last: the structs of its calls are its own."""
+
+    def __init__(self) -> None:
+        self.drawn: _Last | None = None
+        self.filtered: tuple[list[Any], Repeated] | None = None
+
+
 class Unrecorded:
     """Draws for one rasterizer; remembers its last drawing on a GPU, since the next one may be like it."""
 
     def __init__(self, info: RasterizerInfo) -> None:
         self._info = info
-        self._last: _Last | None = None
+        self._kept = _Kept()
 
     def draw(
         self,
@@ -56,7 +66,7 @@ class Unrecorded:
 
         Raises what `check_request` and `call_of` raise; ConfigError for scores.
         """
-        form, last = _form(g, cam, opt), self._last
+        form, last = _form(g, cam, opt), self._kept.drawn
         if form is not None and last is not None and last.form == form:
             call, again = last.call.repeated(camera_numbers(cam)), last.again
         else:
@@ -64,25 +74,50 @@ class Unrecorded:
             if opt.scores or opt.fisher:
                 raise ConfigError("scores are no part of a drawing to be learned from: ask `accumulate` for them")
             call, again = call_of(), cuda.again()
-            self._last = None if form is None else _Last(form, call, again)
+            self._kept.drawn = None if form is None else _Last(form, call, again)
         return call, *_draw(call, tensors, None if form is None else again)
+
+    def radii(self, g: GaussianInputs, cam: Camera) -> Tensor | None:
+        """Return radii [N] int32, px, of ellipsoids on a GPU; None on the CPU, and for what few trainings have.
+
+        Raises what `check_geometry` raises.
+        """
+        rare = g.cov3d, g.geom_indices, g.scale_factors, g.visible
+        if not g.means.is_cuda or any(x is not None for x in rare):
+            return None
+        rows = g.means.shape[0]
+        form = [_kind(x, rows) for x in (g.means, g.scales, g.quats)]
+        last = self._kept.filtered
+        if last is None or last[0] != form:
+            self._info.check_geometry(g)
+            cuda.check()
+            last = self._kept.filtered = form, Repeated(cuda_face, "visible_radii")
+        radii = g.means.new_empty(rows, dtype=torch.int32)
+        last[1](
+            lambda: {"scale_modifier": 1.0, "eps2d": RasterOptions.eps2d, "flags": 0},
+            means=g.means, scales=g.scales, quats=g.quats, radii=radii, count=rows, shapes=rows,
+            camera=tuple(camera_numbers(cam)), width=cam.width, height=cam.height,
+        )  # fmt: skip
+        return radii
 
 
 def _form(g: GaussianInputs, cam: Camera, opt: RasterOptions) -> tuple[Any, ...] | None:
     """Return what checks of a drawing look at; None on the CPU, and for inputs that few trainings have."""
-    sh, rows = g.sh, g.means.shape[:1]
+    sh, rows = g.sh, g.means.shape[0]
     rare = g.cov3d, g.geom_indices, g.scale_factors, g.features, g.visible
     if not g.means.is_cuda or any(x is not None for x in rare):
         return None
     if sh is not None and (sh.dense is not None or sh.codebook is not None):
         return None
     colors = (g.colors,) if sh is None else (sh.dc, sh.rest)
-    forms = [
-        None if t is None else (t.shape[:1] == rows, t.shape[1:], t.dtype, t.get_device(), t.is_contiguous())
-        for t in (g.means, g.opacities, g.scales, g.quats, *colors)
-    ]
+    forms = [_kind(x, rows) for x in (g.means, g.opacities, g.scales, g.quats, *colors)]
     degree = -1 if sh is None else sh.active_degree
     return *forms, degree, opt, cam.width, cam.height, torch.are_deterministic_algorithms_enabled()
+
+
+def _kind(x: Tensor | None, rows: int) -> tuple[Any, ...] | None:
+    """Return what checks of a tensor look at, where its rows may be any number, the same for all."""
+    return None if x is None else (x.shape[0] == rows, x.shape[1:], x.dtype, x.get_device(), x.is_contiguous())
 
 
 def _draw(call: Call, tensors: dict[str, Tensor | None], again: cuda.Again | None) -> tuple[Drawing, Gradients]:
