@@ -113,10 +113,7 @@ class SplatOptimizer:
 
     def zero_grad(self) -> None:
         """Drop the gradients of all parameters of the model, those in no group included."""
-        left: list[Any] = [self.model]
-        while left:  # torch's own way through the modules takes twice as long
-            module = left.pop()
-            left += [part for part in module._modules.values() if part is not None]
+        for module in self.model.modules():
             for param in module._parameters.values():
                 if param is not None:
                     param.grad = None
