@@ -86,12 +86,6 @@ def structure(name: str, fields: list[Field], *, call: bool = False) -> Any:
     return type(name, (ctypes.Structure,), {"_fields_": [*(HEAD if call else ()), *listed]})
 
 
-def _layout(fields: list[Field]) -> str:
-    """Return what the module `struct` packs a call by."""
-    kinds = [f"{f.length or ''}{'P' if f.pointer else NUMBERS[f.kind][1]._type_}" for f in fields]
-    return "".join(["@", *(kind._type_ for _, kind in HEAD), *kinds, "0P"])
-
-
 def operation(name: str, fields: list[Field], function: Any, told: Any, run: int | None, *, on_gpu: bool) -> Any:
     """Return a Python function of the fields by name, which calls `function` and returns the struct with its results.
 
@@ -113,12 +107,13 @@ def operation(name: str, fields: list[Field], function: Any, told: Any, run: int
             f"got {value.dtype} {list(value.shape)} on {value.device}"
         )
 
+    kinds = [f"{f.length or ''}{'P' if f.pointer else NUMBERS[f.kind][1]._type_}" for f in fields]
     # With an underscore, as no field begins: fields are the arguments.
     known = {
         "_torch": torch, "_Tensor": torch.Tensor, "_threads": torch.get_num_threads, "_addressof": ctypes.addressof,
         "_byref": ctypes.byref, "_fields": fields, "_refuse": refuse, "_function": function, "_told": told,
         "_made": structure(f"{name}_call", fields, call=True).from_buffer_copy,
-        "_pack": struct.Struct(_layout(fields)).pack,
+        "_pack": struct.Struct("".join(["@", *(kind._type_ for _, kind in HEAD), *kinds, "0P"])).pack,
     }  # fmt: skip
     # As dataclasses are made: a loop over the fields took three times as long.
     exec(compile(_source(name, fields, run, on_gpu), f"<{name}>", "exec"), known)

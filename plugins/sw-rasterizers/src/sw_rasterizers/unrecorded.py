@@ -34,7 +34,7 @@ class _Last(NamedTuple):
 
 
 class _Kept(threading.local):
-    """What a thread did last: the structs of its calls are its own."""
+    """The last calls of a thread, whose structs are its own."""
 
     def __init__(self) -> None:
         self.drawn: _Last | None = None

@@ -14,8 +14,7 @@ from torch.optim.adam import adam
 from splatwizard_native.fused import cuda_face, face
 from splatwizard_native.fused.native import TRAINING
 
-UPDATE = "4Pq4dq"
-"""The fields of `adam_update` in kernels/face.h, as the module `struct` packs them."""
+UPDATE = "4Pq4dq"  # of `struct`, for `adam_update` of kernels/face.h
 
 
 @dataclass(slots=True)

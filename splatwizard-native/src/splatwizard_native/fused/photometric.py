@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
@@ -42,67 +41,47 @@ def photometric(
 
 
 def photometric_gradient(
-    image: Tensor, target: Tensor, lambda_dssim: float, padding: Padding = "same"
-) -> tuple[Tensor, Tensor, Tensor, Tensor] | None:
-    """Return what `photometric` does and the gradient by `image`, unknown to autograd; None: no kernel takes these."""
+    image: Tensor, target: Tensor, lambda_dssim: float, padding: Padding = "same", *, learns: bool = True
+) -> tuple[Tensor, Tensor, Tensor, Any] | None:
+    """Return what `photometric` does and, if it `learns`, the gradient by `image`; None: no kernel takes these."""
     if not _has_kernel(image, target):
         return None
-    (total, l1, similarity), weights, kept = _means(image, target, lambda_dssim, padding, learns=True)
-    return total, l1, similarity, _gradient(weights, kept).view(image.shape)
-
-
-def _means(
-    x: Tensor, y: Tensor, lambda_dssim: float, padding: Padding, *, learns: bool
-) -> tuple[tuple[Tensor, ...], dict[str, Any], tuple[Any, ...]]:
-    """Return the total and both means, each a tensor of its own, and what `_gradient` needs: weights and tensors.
-
-    On the CPU the gradient is computed along with the value; on CUDA no number is waited for, and the gradient is put
-    together when its scale is known.
-    """
-    image, target = (t.reshape(-1, *t.shape[-2:]).contiguous() if t.dim() != 3 else t.contiguous() for t in (x, y))
-    planes, height, width = image.shape
+    x, y = (t.reshape(-1, *t.shape[-2:]).contiguous() if t.dim() != 3 else t.contiguous() for t in (image, target))
+    planes, height, width = x.shape
     weights = dict[str, Any](valid=padding == "valid", l1_weight=1.0 - lambda_dssim, ssim_weight=-lambda_dssim)
-    if x.is_cuda:
-        total, l1, similarity = found = tuple(image.new_empty(()) for _ in range(3))
-        slopes = image.new_empty(3, *image.shape) if learns else None
-        sums = image.new_empty(2 + 2 * planes * -(-height // TILE) * -(-width // TILE))
+    grad = torch.empty_like(x) if learns else None
+    if x.is_cuda:  # no number is waited for
+        total, l1, similarity = (x.new_empty(()) for _ in range(3))
+        slopes = x.new_empty(3, *x.shape) if learns else None
+        sums = x.new_empty(2 + 2 * planes * -(-height // TILE) * -(-width // TILE))
         cuda_face.photometric_loss(  # addresses of what is made here, which fits, spare its checks
-            x=image, y=target, **weights, offset=lambda_dssim, total=total.data_ptr(), l1=l1.data_ptr(),
+            x=x, y=y, **weights, offset=lambda_dssim, total=total.data_ptr(), l1=l1.data_ptr(),
             ssim=similarity.data_ptr(), slopes=None if slopes is None else slopes.data_ptr(), sums=sums.data_ptr(),
             sum_count=sums.numel(),
         )  # fmt: skip
-        return found, weights, (image, target, slopes)
-    grad = torch.empty_like(image) if learns else None
-    row_sums = image.new_empty(2, planes, height, dtype=torch.float64)
-    told = face.photometric(x=image, y=target, **weights, grad=grad, row_sums=row_sums)
-    whole = lambda_dssim + weights["l1_weight"] * told.l1 + weights["ssim_weight"] * told.ssim
-    return tuple(map(x.new_tensor, (whole, told.l1, told.ssim))), weights, (grad,)
-
-
-def _gradient(weights: dict[str, Any], kept: Sequence[Tensor], scale: Tensor | None = None) -> Tensor:
-    """Return `scale`, or 1, times the gradient of the total by the image, [planes, H, W]."""
-    if kept[0].is_cuda:
-        x, y, slopes = kept
-        grad = torch.empty_like(x)
-        cuda_face.photometric_loss_backward(x=x, y=y, slopes=slopes, **weights, scale=scale, grad=grad.data_ptr())
-        return grad
-    return kept[0] if scale is None or float(scale) == 1.0 else kept[0] * scale  # 1 but for weighted losses
+        if grad is not None and slopes is not None:
+            cuda_face.photometric_loss_backward(x=x, y=y, slopes=slopes, **weights, grad=grad.data_ptr())
+    else:
+        row_sums = x.new_empty(2, planes, height, dtype=torch.float64)
+        told = face.photometric(x=x, y=y, **weights, grad=grad, row_sums=row_sums)
+        whole = lambda_dssim + weights["l1_weight"] * told.l1 + weights["ssim_weight"] * told.ssim
+        total, l1, similarity = map(x.new_tensor, (whole, told.l1, told.ssim))
+    return total, l1, similarity, None if grad is None else grad.view(image.shape)
 
 
 class _Photometric(torch.autograd.Function):  # (learns, x, y, lambda, padding) -> total, L1, SSIM
     @staticmethod
-    def forward(
-        ctx: Any, learns: bool, x: Tensor, y: Tensor, lambda_dssim: float, padding: Padding
-    ) -> tuple[Tensor, ...]:
-        ctx.shape, (found, ctx.weights, kept) = x.shape, _means(x, y, lambda_dssim, padding, learns=learns)
-        ctx.save_for_backward(*kept)
+    def forward(ctx: Any, learns: bool, *given: Any) -> tuple[Tensor, ...]:
+        *found, grad = photometric_gradient(*given, learns=learns)  # type: ignore[misc]
+        ctx.save_for_backward(grad)
         ctx.mark_non_differentiable(*found[1:])
-        return found
+        return tuple(found)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, scale: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
-        return None, _gradient(ctx.weights, ctx.saved_tensors, scale).view(ctx.shape), None, None, None
+        (grad,) = ctx.saved_tensors  # times 1 nearly always, as a look shows where it waits for nobody
+        return None, grad if scale.is_cpu and float(scale) == 1.0 else grad * scale, None, None, None
 
 
 def ssim_map(x: Tensor, y: Tensor, padding: Padding = "same") -> Tensor:
