@@ -77,14 +77,11 @@ def toolkit_mismatch() -> str | None:
 
 def architectures() -> list[str]:
     """Compute capabilities to compile for: $TORCH_CUDA_ARCH_LIST, else those of the GPUs here, else 8.0 and 9.0."""
-    listed = os.environ.get("TORCH_CUDA_ARCH_LIST", "")
-    if listed:
-        asked = sorted(a for a in re.split(r"[ ;,]+", listed) if a)
-        for a in asked:
-            if not ARCHITECTURE.fullmatch(a):
-                raise NativeBuildError(f"$TORCH_CUDA_ARCH_LIST names '{a}': give compute capabilities, as 8.0;9.0")
-        return asked
-    return [f"{major}.{minor}" for major, minor in gpus()] or ["8.0", "9.0"]
+    asked = sorted(a for a in re.split(r"[ ;,]+", os.environ.get("TORCH_CUDA_ARCH_LIST", "")) if a)
+    for a in asked:
+        if not ARCHITECTURE.fullmatch(a):
+            raise NativeBuildError(f"$TORCH_CUDA_ARCH_LIST names '{a}': give compute capabilities, as 8.0;9.0")
+    return asked or [f"{major}.{minor}" for major, minor in gpus()] or ["8.0", "9.0"]
 
 
 def runs_on(architecture: str, gpu: tuple[int, int]) -> bool:
@@ -100,6 +97,5 @@ def gpus() -> list[tuple[int, int]]:
     """Compute capabilities of the GPUs that torch sees, each once, in order."""
     import torch
 
-    if not torch.cuda.is_available():
-        return []
-    return sorted({torch.cuda.get_device_capability(i) for i in range(torch.cuda.device_count())})
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    return sorted({torch.cuda.get_device_capability(i) for i in range(count)})

@@ -114,13 +114,13 @@ class Trainer:
             if ppl.clamp_render:
                 result.image = result.image.clamp(0, 1)
             mark("render")
-            loss = self._keep(stage.loss(model, view, result, background, step))
+            loss = stage.loss(model, view, result, background, step)
             mark("loss")
             self._backward(loss.total)
             mark("backward")
-        else:
-            result, loss = found[0], self._keep(found[1])
-        state.result, state.loss = result, loss
+            found = result, loss
+        result, loss = state.result, state.loss = found
+        self._keep(loss)
         with torch.no_grad():
             stop = state.post.exec(step, state) or stop
             self._check_rows()
@@ -148,8 +148,8 @@ class Trainer:
         engine: Any = torch.autograd.Variable._execution_engine
         engine.run_backward((total,), (self._one,), False, False, (), allow_unreachable=True, accumulate_grad=True)
 
-    def _keep(self, loss: LossPack) -> LossPack:
-        """Store the step's loss in the state, and return it; check all unchecked losses every CHECK_EVERY steps."""
+    def _keep(self, loss: LossPack) -> None:
+        """Store the step's loss in the state; check all unchecked losses every CHECK_EVERY steps."""
         state = self.state
         state.total = loss.total.detach()
         state.parts = {name: part.detach() if part.requires_grad else part for name, part in loss.parts.items()}
@@ -159,7 +159,6 @@ class Trainer:
             self.check_losses()
         elif len(self._unchecked) >= CHECK_EVERY:
             self._look()
-        return loss
 
     def check_losses(self) -> None:
         """Raise TrainingDiverged if a loss since the last look is not finite. Waits for the device."""

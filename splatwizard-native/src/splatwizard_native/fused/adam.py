@@ -86,12 +86,10 @@ def _check(u: AdamUpdate) -> None:
 
 @torch.no_grad()
 def _by_torch(u: AdamUpdate) -> None:
-    param, exp_avg, exp_avg_sq = u.param, u.exp_avg, u.exp_avg_sq
-    grad = u.grad.contiguous()
-    whole = all(t.is_contiguous() for t in (param, exp_avg, exp_avg_sq))
-    count = torch.tensor(float(u.step - 1), device=param.device)  # steps done; torch counts this one itself
+    whole = all(t.is_contiguous() for t in (u.param, u.exp_avg, u.exp_avg_sq))
+    count = torch.tensor(float(u.step - 1), device=u.param.device)  # steps done; torch counts this one itself
     adam(
-        [param], [grad], [exp_avg], [exp_avg_sq], [], [count], fused=whole, foreach=False, amsgrad=False,
-        maximize=False, weight_decay=0.0, lr=u.lr, beta1=u.beta1, beta2=u.beta2, eps=u.eps,
+        [u.param], [u.grad.contiguous()], [u.exp_avg], [u.exp_avg_sq], [], [count], fused=whole, foreach=False,
+        amsgrad=False, maximize=False, weight_decay=0.0, lr=u.lr, beta1=u.beta1, beta2=u.beta2, eps=u.eps,
     )  # fmt: skip
-    torch.autograd.graph.increment_version(param)
+    torch.autograd.graph.increment_version(u.param)

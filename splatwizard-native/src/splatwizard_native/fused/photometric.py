@@ -15,10 +15,8 @@ from splatwizard_native.fused.native import TRAINING
 Padding = Literal["same", "valid"]
 
 TILE = 32  # pixels of a block of the CUDA kernel, each way
-RADIUS = 5  # 11 x 11 window
-SIGMA = 1.5
-C1 = 0.01**2
-C2 = 0.03**2
+RADIUS, SIGMA = 5, 1.5  # 11 x 11 window
+C1, C2 = 0.01**2, 0.03**2
 
 
 def photometric(
@@ -62,8 +60,7 @@ def photometric_gradient(
         if grad is not None and slopes is not None:
             cuda_face.photometric_loss_backward(x=x, y=y, slopes=slopes, **weights, grad=grad.data_ptr())
     else:
-        row_sums = x.new_empty(2, planes, height, dtype=torch.float64)
-        told = face.photometric(x=x, y=y, **weights, grad=grad, row_sums=row_sums)
+        told = face.photometric(x=x, y=y, **weights, grad=grad, row_sums=x.new_empty(2, planes, height).double())
         whole = lambda_dssim + weights["l1_weight"] * told.l1 + weights["ssim_weight"] * told.ssim
         total, l1, similarity = map(x.new_tensor, (whole, told.l1, told.ssim))
     return total, l1, similarity, None if grad is None else grad.view(image.shape)
