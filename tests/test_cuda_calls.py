@@ -417,7 +417,10 @@ def test_radii_of_ellipsoids_that_are_alike_are_checked_once(drawn):
         assert (call.means, call.quats, call.radii) == (g.means.data_ptr(), g.quats.data_ptr(), radii.data_ptr())
         assert (call.count, call.shapes, len(radii), call.width) == (rows, rows, rows, 32)
         assert (list(call.camera)[9:12], call.eps2d) == ([1, 1, 1], pytest.approx(0.3))
-    for scales in (rand(5, 2), rand(4, 3), rand(3, 5).T):
+    g.quats = rand(4).expand(5, 4)  # as anchors have them: a copy is handed over
+    rasterizer.visible_filter(g, camera)
+    assert drawn["visible_radii"][-1].quats != g.quats.data_ptr()
+    for scales in (rand(5, 2), rand(4, 3)):
         g.scales = scales
         with pytest.raises((CapabilityError, ShapeError, RuntimeError)):
             rasterizer.visible_filter(g, camera)

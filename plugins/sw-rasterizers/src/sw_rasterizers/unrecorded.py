@@ -86,7 +86,8 @@ class Unrecorded:
         if not g.means.is_cuda or any(x is not None for x in rare):
             return None
         rows = g.means.shape[0]
-        form = [_kind(x, rows) for x in (g.means, g.scales, g.quats)]
+        means, scales, quats = (None if x is None else x.contiguous() for x in (g.means, g.scales, g.quats))
+        form = [_kind(x, rows) for x in (means, scales, quats)]
         last = self._kept.filtered
         if last is None or last[0] != form:
             self._info.check_geometry(g)
@@ -95,7 +96,7 @@ class Unrecorded:
         radii = g.means.new_empty(rows, dtype=torch.int32)
         last[1](
             lambda: {"scale_modifier": 1.0, "eps2d": RasterOptions.eps2d, "flags": 0},
-            means=g.means, scales=g.scales, quats=g.quats, radii=radii, count=rows, shapes=rows,
+            means=means, scales=scales, quats=quats, radii=radii, count=rows, shapes=rows,
             camera=tuple(camera_numbers(cam)), width=cam.width, height=cam.height,
         )  # fmt: skip
         return radii
