@@ -177,8 +177,7 @@ class AnchorStage(Stage):
     def mean_volume(self, result: RenderResult) -> Tensor:
         """Return the mean volume (product of scales) of the rendered Gaussians, a scalar; differentiable."""
         assert result.inputs.scales is not None
-        mean = fast_loss.mean_product if fast_enabled() else mean_product
-        return mean(result.inputs.scales)
+        return (fast_loss.mean_product if fast_enabled() else mean_product)(result.inputs.scales)
 
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
         truth, terms = view.image(background, result.image.device), self.terms(model, result, step)
