@@ -139,7 +139,7 @@ class AnchorSplats(SplatModel):
         if self._opaque is None or self._opaque[0] != key:
             # Made on the CPU, and anew at each step, they would have to be waited for on a GPU.
             one, identity = positions.new_ones(1), torch.eye(1, 4, dtype=positions.dtype, device=positions.device)
-            self._opaque = (key, one.expand(len(positions)), identity.expand(len(positions), 4))
+            self._opaque = (key, one.expand(len(positions)), identity.repeat(len(positions), 1))
         _, opacities, quats = self._opaque
         return GaussianInputs(positions, opacities, self.reach(), quats, colors=positions)
 

@@ -10,7 +10,7 @@ from sw_anchors.coded_anchors import ENTROPY, FULL, QUANTIZED, CodedAnchors
 from sw_anchors.fast import replay
 from sw_anchors.fast.fixed_step import FixedRows, sample_capacity, sample_of
 from sw_anchors.fast.replay import FixedDecoder
-from sw_anchors.fast.seen_rows import ExpectedRows, SeenRows, capacity_of
+from sw_anchors.fast.seen_rows import AnchorOrder, ExpectedRows, SeenRows, capacity_of
 from sw_anchors.testing import check_plain, check_replayed
 from sw_reference.testing.raster_scenes import front_camera
 
@@ -233,7 +233,7 @@ def test_rows_beyond_the_places_are_left_out_and_told(seen):
     order = torch.randperm(50, generator=torch.Generator().manual_seed(0))
     mask = torch.zeros(50, dtype=torch.bool)
     mask[torch.randperm(50, generator=torch.Generator().manual_seed(1))[:seen]] = True
-    rows, count = ExpectedRows(order, mask, 10), torch.zeros(())
+    rows, count = ExpectedRows(AnchorOrder(order), mask, 10), torch.zeros(())
     rows.write_number(count)
     assert rows.number() == int(count) == seen
     assert rows.loaded.tolist() == (order[mask].tolist() + [0] * 10)[:10]
@@ -248,7 +248,7 @@ def test_rows_that_are_known_and_those_that_are_found_answer_alike(seen):
     mask[torch.randperm(400, generator=torch.Generator().manual_seed(1))[:seen]] = True
     wanted, count = torch.nonzero(mask).squeeze(1), torch.zeros(())
     known = SeenRows(wanted)
-    for rows in (known, ExpectedRows(torch.arange(400), mask, known.capacity)):
+    for rows in (known, ExpectedRows(AnchorOrder(torch.arange(400)), mask, known.capacity)):
         assert rows.capacity == capacity_of(seen)
         assert torch.equal(rows.known(), wanted)
         assert torch.equal(rows.placed(), wanted)
@@ -326,7 +326,7 @@ def test_graphs_are_made_anew_when_networks_or_phase_change():
 @pytest.mark.cuda
 def test_graphs_of_a_view_that_comes_again_wait_for_no_count():
     check_views_that_come_again("cuda", graphs=True)
-    order, seen = torch.arange(1000, device="cuda"), torch.arange(1000, device="cuda") % 3 == 0
+    order, seen = AnchorOrder(torch.arange(1000, device="cuda")), torch.arange(1000, device="cuda") % 3 == 0
     torch.cuda.synchronize()
     torch.cuda.set_sync_debug_mode("error")
     try:
@@ -340,8 +340,8 @@ def test_graphs_of_a_view_that_comes_again_wait_for_no_count():
 @pytest.mark.cuda
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs a GPU that is not the current one")
 def test_the_count_is_waited_for_on_the_device_of_the_anchors():
-    order = torch.arange(1000, device="cuda:1")
-    ExpectedRows(order, order < 5, 512).number()  # memory of the host is set aside before
+    order = AnchorOrder(torch.arange(1000, device="cuda:1"))
+    ExpectedRows(order, order.rows < 5, 512).number()  # memory of the host is set aside before
     with torch.cuda.device(1):
         torch.cuda._sleep(1_000_000_000)
-    assert ExpectedRows(order, order % 3 == 0, 512).number() == 334
+    assert ExpectedRows(order, order.rows % 3 == 0, 512).number() == 334

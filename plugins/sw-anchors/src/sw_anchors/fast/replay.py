@@ -31,7 +31,7 @@ from sw_anchors.fast.fixed_step import (
     sample_capacity,
 )
 from sw_anchors.fast.rows import add_rows, put_rows
-from sw_anchors.fast.seen_rows import ExpectedRows, SeenRows, capacity_of
+from sw_anchors.fast.seen_rows import AnchorOrder, ExpectedRows, SeenRows, capacity_of
 from sw_anchors.native import ANCHORS
 from sw_anchors.noisy_values import ENTROPY
 
@@ -99,14 +99,14 @@ class FixedDecoder:
         self._watched = Watched([])
         self._shared: dict[str, Tensor] = {}
         self._seen: WeakKeyDictionary[Camera, tuple[int, int]] = WeakKeyDictionary()  # anchors, and of how many
-        self._order: tuple[Tensor, Tensor] | None = None
+        self._order: tuple[Tensor, AnchorOrder] | None = None
 
     def gaussians(self, model: Model, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
         """The Gaussians of the visible anchors."""
         places = self.expected(camera, model.num_rows)
         with torch.no_grad():
             order, seen = self._in_order(model, rasterizer.visible_filter(model.balls(), camera) > 0)
-            rows = SeenRows(order[seen]) if places is None else ExpectedRows(order, seen, places)
+            rows = SeenRows(order.rows[seen]) if places is None else ExpectedRows(order, seen, places)
         found = self.decode(model, camera, rows)
         if found is None:
             with torch.no_grad():
@@ -114,16 +114,16 @@ class FixedDecoder:
             return model.decode(camera, known)
         return found
 
-    def _in_order(self, model: Model, visible: Tensor) -> tuple[Tensor, Tensor]:
-        """Rows [N] int64 of all anchors, neighbours together, and whether each is visible [N].
+    def _in_order(self, model: Model, visible: Tensor) -> tuple[AnchorOrder, Tensor]:
+        """All anchors, neighbours together, and whether each is visible [N] bool.
 
         Gradients of neighbours meet in the same cells of grids and planes: kernels add those up before they write.
         """
         codes = model.codes()
         if self._order is None or self._order[0] is not codes:
-            self._order = codes, torch.argsort(interleave(codes))
+            self._order = codes, AnchorOrder(torch.argsort(interleave(codes)))
         order = self._order[1]
-        return order, visible.index_select(0, order)
+        return order, visible.index_select(0, order.rows)
 
     def expected(self, camera: Camera, num_rows: int) -> int | None:
         """Return the expected capacity for this camera's anchors; None: camera not seen before, or none visible.

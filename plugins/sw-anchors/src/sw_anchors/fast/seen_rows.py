@@ -12,6 +12,21 @@ MIN_CAPACITY = 256
 """Smallest capacity."""
 
 
+class AnchorOrder:
+    """An order of all anchors.
+
+    rows        [N] int64
+    padded      the same, and behind them row 0, [N+1]
+    numbers     1, 2, ..., as many as the largest capacity has places
+    """
+
+    def __init__(self, rows: Tensor) -> None:
+        """Take rows [N] int64."""
+        self.padded = torch.cat([rows, rows.new_zeros(1)])
+        self.rows = self.padded[:-1]
+        self.numbers = torch.arange(1, capacity_of(len(rows)) + 1, device=rows.device)
+
+
 class SeenRows:
     """Rows of the visible anchors, known to the host.
 
@@ -47,22 +62,21 @@ class ExpectedRows(SeenRows):
     capacity    C
     """
 
-    def __init__(self, order: Tensor, seen: Tensor, places: int) -> None:
-        """Take the first `places` rows of order [N] int64 that are seen [N] bool; N > 0."""
+    def __init__(self, order: AnchorOrder, seen: Tensor, places: int) -> None:
+        """Take the first `places` rows in order that are seen [N] bool; N > 0."""
         self._order, self._seen = order, seen
         taken = seen.cumsum(0)
         self._count = taken[-1]
         # Of each place the first row that brings the number of seen ones there: a scatter may write in any order.
-        wanted = torch.arange(1, places + 1, device=order.device)
-        at = torch.searchsorted(taken, wanted).clamp_(max=len(order) - 1)
-        self.loaded, self.capacity = order[at].masked_fill_(wanted > self._count, 0), places
+        at = torch.searchsorted(taken, order.numbers[:places])
+        self.loaded, self.capacity = order.padded.index_select(0, at), places
         self._on_host, self._copied = self._count, None
-        if order.is_cuda:
+        if seen.is_cuda:
             self._on_host = torch.empty((), dtype=torch.int64, pin_memory=True)
             self._on_host.copy_(self._count, non_blocking=True)
             self._copied = torch.cuda.Event()  # type: ignore[no-untyped-call]
             # Of its own device: another may be the current one, whose stream has nothing to do with the copy.
-            self._copied.record(torch.cuda.current_stream(order.device))
+            self._copied.record(torch.cuda.current_stream(seen.device))
 
     def number(self) -> int:
         """Number of seen rows, perhaps more than there are places. Waits until the device has counted them."""
@@ -83,7 +97,7 @@ class ExpectedRows(SeenRows):
 
     def known(self) -> Tensor:
         """All visible rows, see SeenRows; waits for the device."""
-        return self._order[self._seen]
+        return self._order.rows[self._seen]
 
 
 def capacity_of(count: int) -> int:
