@@ -149,9 +149,10 @@ def test_rows_and_products_have_their_gradients():
     assert all(torch.equal(x, y[rows]) for x, y in zip(take_rows(rows, a, b), (a, b), strict=True))
     assert torch.autograd.gradcheck(lambda x, y: take_rows(rows, x, y), (a, b))
     for mean_product in (loss.mean_product, stage.mean_product):
-        torch.testing.assert_close(mean_product(scales), scales.prod(dim=1).mean())
-        assert torch.autograd.gradcheck(mean_product, scales)
-        assert float(mean_product(torch.zeros(0, 3))) == 0
+        for count in (7, torch.tensor(7)):
+            torch.testing.assert_close(mean_product(scales, count), scales.prod(dim=1).sum() / 7)
+            assert torch.autograd.gradcheck(mean_product, (scales, count))
+        assert float(mean_product(torch.zeros(0, 3), 1)) == 0
 
 
 @pytest.mark.cuda

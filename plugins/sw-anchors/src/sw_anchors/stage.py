@@ -174,10 +174,9 @@ class AnchorStage(Stage):
         """Return further loss terms by name: a scalar, or (weight, scalar), which needs fewer GPU launches."""
         return {}
 
-    def mean_volume(self, result: RenderResult) -> Tensor:
-        """Return the mean volume (product of scales) of the rendered Gaussians, a scalar; differentiable."""
-        assert result.inputs.scales is not None
-        return (fast_loss.mean_product if fast_enabled() else mean_product)(result.inputs.scales)
+    def counted(self, result: RenderResult) -> int | Tensor:
+        """Return of how many Gaussians the mean volume is, at least 1; a scalar if a tensor."""
+        return max(len(result.inputs.means), 1)
 
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
         truth, terms = view.image(background, result.image.device), self.terms(model, result, step)
@@ -185,18 +184,27 @@ class AnchorStage(Stage):
         total, *weighted = (fast_loss.weighted_sum if fast_enabled() else weighted_sum)(found.total, *terms.values())
         return LossPack(total, found.parts | dict(zip(terms, weighted, strict=True)))
 
-    def terms(self, model: Any, result: RenderResult, step: int) -> dict[str, Weighted]:
-        """Return the terms beside the photometric loss: the volume, and the extra ones."""
-        terms = {"volume": (self.opt.loss.volume, self.mean_volume(result)), **self.extra_loss(model, result, step)}
+    def terms(
+        self, model: Any, result: RenderResult, step: int, *, volume: Tensor | None = None
+    ) -> dict[str, Weighted]:
+        """Return the terms beside the photometric loss: the mean volume (product of scales), and the extra ones.
+
+        volume  where it is known already
+        """
+        if volume is None:
+            assert result.inputs.scales is not None
+            mean = fast_loss.mean_product if fast_enabled() else mean_product
+            volume = mean(result.inputs.scales, self.counted(result))
+        terms = {"volume": (self.opt.loss.volume, volume), **self.extra_loss(model, result, step)}
         return {name: t if isinstance(t, tuple) else (1.0, t) for name, t in terms.items()}
 
     def whole_step(self, state: Any, view: View, camera: Any, background: Tensor) -> Any:
         return self._whole.of(self, state, view, camera, background) if type(self).loss is AnchorStage.loss else None
 
 
-def mean_product(scales: Tensor) -> Tensor:
-    """Return the mean over rows of the product of scales [M,3], 0 if M = 0; a scalar, differentiable."""
-    return scales.prod(dim=1).sum() / max(len(scales), 1)
+def mean_product(scales: Tensor, count: int | Tensor) -> Tensor:
+    """Return the sum over rows of the product of scales [M,3], over a count; a scalar, differentiable."""
+    return scales.prod(dim=1).sum() / count
 
 
 def weighted_sum(start: Tensor, *terms: Weighted) -> tuple[Tensor, ...]:

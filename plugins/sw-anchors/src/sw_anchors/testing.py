@@ -155,7 +155,7 @@ def _one_step(
     assert inputs is not None
     drawn = {name: t for name, t in inputs.tensors().items() if t.is_floating_point()}
     assert inputs.scales is not None
-    found = {"volume": mean_product(inputs.scales)}
+    found = {"volume": mean_product(inputs.scales, max(len(inputs.scales), 1))}
     rate = inputs.extras.get("rate")
     if rate is not None:
         found |= {"bits": rate.bits} | ({} if rate.own_bits is None else {"own bits": 1e-4 * rate.own_bits})

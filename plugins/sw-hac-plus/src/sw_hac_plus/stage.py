@@ -40,9 +40,6 @@ class HACPlusStage(HACStage):
             return rates
         return {**rates, "channel": self.decay(step, lr.channel_init, lr.channel_final)}
 
-    def mean_volume(self, result: RenderResult) -> Tensor:
-        """Return the mean product of the scales, scalar; masked Gaussians count with a volume of 0."""
-        selection = result.extras["anchors"]
-        assert result.inputs.scales is not None
-        share = len(result.inputs.scales) / (selection.opacities > 0).sum().clamp(min=1)
-        return super().mean_volume(result) * share
+    def counted(self, result: RenderResult) -> Tensor:
+        """Return how many Gaussians are drawn or masked, at least 1: masked ones count with a volume of 0."""
+        return (result.extras["anchors"].opacities > 0).sum().clamp(min=1)

@@ -9,26 +9,31 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 
-def mean_product(scales: Tensor) -> Tensor:
+def mean_product(scales: Tensor, count: int | Tensor) -> Tensor:
     """Fast version of `stage.mean_product`, whose backward tests for zeros and so waits for a GPU."""
-    found: Tensor = _MeanProduct.apply(scales)  # type: ignore[no-untyped-call]
+    found: Tensor = _MeanProduct.apply(scales, count)  # type: ignore[no-untyped-call]
     return found
 
 
 class _MeanProduct(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, scales: Tensor) -> Tensor:
-        ctx.save_for_backward(scales)
-        x, y, z = scales.unbind(1)
-        total: Tensor = (x * y * z).sum() / max(len(scales), 1)
-        return total
+    def forward(ctx: Any, scales: Tensor, count: int | Tensor) -> Tensor:
+        found, others = product_and_slopes(scales, count)
+        ctx.save_for_backward(others)
+        ctx.count = count
+        return found
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> Tensor:
-        (scales,) = ctx.saved_tensors
-        found: Tensor = grad / max(len(scales), 1) * scales.roll(1, 1) * scales.roll(-1, 1)
-        return found
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        (others,) = ctx.saved_tensors
+        return others * (grad / ctx.count), None
+
+
+def product_and_slopes(scales: Tensor, count: int | Tensor) -> tuple[Tensor, Tensor]:
+    """Return `mean_product` without gradient, and count times its gradient, the products of the two other scales."""
+    others = scales.roll(1, 1) * scales.roll(-1, 1)
+    return (others[:, 0] * scales[:, 0]).sum() / count, others
 
 
 def weighted_sum(start: Tensor, *terms: tuple[float, Tensor]) -> tuple[Tensor, ...]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import functools
 from typing import TYPE_CHECKING, Any
 
+import torch
 from sw_gaussians.fast.whole_step import WholeStep
+
+from sw_anchors.fast.loss import product_and_slopes
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -13,6 +15,7 @@ if TYPE_CHECKING:
     from splatwizard_core.api import Camera, LossPack, RasterOptions, RenderResult, TrainingState, View
 
 Step = tuple["RenderResult", "LossPack"]
+Weighted = tuple[float, "Tensor"]
 
 
 class WholeAnchorStep(WholeStep):
@@ -27,9 +30,18 @@ class WholeAnchorStep(WholeStep):
         model, step = state.model, state.step
         inputs = model.gaussians(camera, state.rasterizer)
         options = self._kept = _the_same(self._kept, stage.raster_options(step, background))
-        terms = functools.partial(stage.terms, model, step=step)
-        weight = stage.opt.loss.lambda_dssim
-        found = self.through(inputs, options, weight, state, view, camera, background, terms)
+        settings = stage.opt.loss
+
+        def terms(result: RenderResult, by: dict[str, Tensor]) -> dict[str, Weighted]:
+            assert result.inputs.scales is not None
+            count = stage.counted(result)
+            with torch.no_grad():
+                volume, others = product_and_slopes(result.inputs.scales, count)
+                by["scales"] += others * (settings.volume / count)
+            found: dict[str, Weighted] = stage.terms(model, result, step, volume=volume)
+            return found
+
+        found = self.through(inputs, options, settings.lambda_dssim, state, view, camera, background, terms)
         if found is not None:
             return found
         # From what has been decoded: noise is drawn once.

@@ -111,11 +111,12 @@ class WholeStep:
         view: View,
         camera: Camera,
         background: Tensor,
-        terms: Callable[[RenderResult], Mapping[str, tuple[float, Tensor]]],
+        terms: Callable[[RenderResult, dict[str, Tensor]], Mapping[str, tuple[float, Tensor]]],
     ) -> tuple[RenderResult, LossPack] | None:
         """Do the same for Gaussians that autograd knows, with colours of their own; None where it cannot.
 
-        terms   weights and scalars by name, whose products the loss has besides
+        terms   weights and scalars by name, whose products the loss has besides; those that autograd does not know
+                have added theirs to the gradients of the inputs by name
         """
         truth = view.image(background, g.means.device)
         if not _fits(truth, camera) or g.sh is not None or g.means.dtype != torch.float32:
@@ -130,7 +131,7 @@ class WholeStep:
                 return None
             total, l1, similarity, by_image = loss
             by = gradients(by_image)  # the GPU works while the host puts the terms together
-        parts, further = {"l1": l1, "ssim": similarity}, terms(result)
+        parts, further = {"l1": l1, "ssim": similarity}, terms(result, by)
         weights = self._weights_of(further, total)
         if further:
             with torch.no_grad():
