@@ -17,6 +17,7 @@ sys.path.insert(0, str(ROOT / "tools"))
 import build_cuda_wheel  # noqa: E402
 import build_wheels  # noqa: E402
 
+from splatwizard_core.cli.list_plugins import gather  # noqa: E402
 from splatwizard_native import Toolchain  # noqa: E402
 from splatwizard_native.toolchain import Job  # noqa: E402
 
@@ -38,6 +39,13 @@ def test_its_wheel_takes_them_and_tells_the_platform(package):
     assert "\n[tool.hatch.build.targets.wheel.hooks.custom]\n" in project
     hook = (package / "hatch_build.py").read_text("utf-8")
     assert hook == (ROOT / "splatwizard-native" / "hatch_build.py").read_text("utf-8")
+
+
+def test_each_package_lists_the_state_of_all_kernels_that_it_computes_with():
+    listed = {row["distribution"]: row["kernels"] for row in gather()["plugins"]}
+    assert listed["sw-hac"].keys() == {"sw_anchors", "sw_codecs", "sw_hac"}
+    assert listed["sw-hac"]["sw_anchors"] == listed["sw-cat-3dgs"]["sw_anchors"]
+    assert {state for kernels in listed.values() for state in kernels.values()} <= {"prebuilt", "built", "reference"}
 
 
 def test_the_tag_names_the_newest_glibc_of_all_libraries(tmp_path):

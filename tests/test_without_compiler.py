@@ -72,10 +72,14 @@ def test_a_wheel_has_the_same_bytes_wherever_it_is_built(wheels, tmp_path):
     assert again.read_bytes() == before.read_bytes()
 
 
-def test_the_doctor_says_of_each_module_that_it_is_prebuilt(wheels, environment, tmp_path):
+def test_doctor_and_list_say_of_each_module_that_it_is_prebuilt(wheels, environment, tmp_path):
     around = without_compiler(environment, tmp_path / "cache")
     found = json.loads(environment.run("doctor", "--json", check=False, **around).stdout)
     kernels = [check for check in found["checks"] if check["group"] == "kernels"]
     prebuilt = [check["facts"]["state"] == "prebuilt" for check in kernels if check["facts"]["target"] == "cpu"]
     assert len(prebuilt) >= 7
     assert all(prebuilt)  # kernels for a GPU are told too, where torch has CUDA: nvcc compiles them
+    listed = json.loads(environment.run("list-plugins", "--json", **around).stdout)["plugins"]
+    states = [state for each in listed for state in each["kernels"].values()]
+    assert len(states) >= 7
+    assert set(states) == {"prebuilt"}

@@ -80,11 +80,14 @@ def test_available_and_state_compile_nothing(package):
 
 
 @needs_compiler
-def test_a_cache_that_cannot_be_written_is_named(package, monkeypatch, tmp_path):
+def test_a_cache_that_cannot_be_written_is_named_and_left_to_the_fallback(package, monkeypatch, caplog, tmp_path):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("SPLATWIZARD_CACHE", str(tmp_path / "file" / "below"))
     with pytest.raises(NativeBuildError, match=r"cannot write .*below.*SPLATWIZARD_CACHE"):
         package.module().load()
+    assert not package.module().try_load()
+    (message,) = caplog.messages
+    assert "answers are guessed" in message
 
 
 @needs_compiler

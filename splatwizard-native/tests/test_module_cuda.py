@@ -3,12 +3,13 @@
 import importlib
 import json
 import re
+import subprocess
 from pathlib import Path
 
 import pytest
 from native_package import digest_of, needs_compiler
 
-from splatwizard_native import NativeBuildError, cuda_toolkit, toolchain
+from splatwizard_native import NativeBuildError, cuda_toolkit, find_compiler, toolchain
 
 CUDA_KERNEL = """
 #include "value.h"
@@ -171,3 +172,43 @@ def test_a_distributed_cuda_library_is_used_without_a_cuda_compiler_if_it_fits_t
     assert module.state()["state"] == "prebuilt"
     package.write("fill.cu", CUDA_KERNEL + "// changed\n")
     assert not list(module._existing())
+
+
+def of_another_abi(library: Path) -> None:
+    source = library.with_suffix(".c")
+    told = 'const char* answer_hash(void) { return ""; } const char* answer_last_error(void) { return ""; }'
+    source.write_text(f"unsigned answer_abi(void) {{ return 2; }} {told} int answer_look(void* c) {{ return 0; }}")
+    subprocess.run([*find_compiler(), "-x", "c", "-shared", "-fPIC", source, "-o", library], check=True)
+
+
+@needs_compiler
+@pytest.mark.parametrize("damage", ["of another ABI", "for another platform", "truncated"])
+def test_a_broken_distributed_cuda_library_costs_one_line_and_is_left_to_the_reference(
+    package, monkeypatch, caplog, tmp_path, damage
+):
+    import torch
+
+    package.write("face.h", GPU_FACE)
+    package.write("fill.cu", CUDA_KERNEL)
+    of_gpu = package.module(cuda_sources=("fill.cu",), face="face.h")
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    monkeypatch.setattr(cuda_toolkit, "find_nvcc", lambda: None)
+    monkeypatch.setattr(cuda_toolkit, "gpus", lambda: [(9, 0)])
+    shipped = tmp_path / damage.replace(" ", "_")
+    monkeypatch.setattr(cuda_toolkit, "distributed", lambda: [shipped / "prebuilt"])
+    library = shipped / "prebuilt" / of_gpu.prebuilt_name("portable")
+    library.parent.mkdir(parents=True)
+    of_another_abi(library)
+    content = library.read_bytes()
+    if damage == "for another platform":
+        library.write_bytes(content[:18] + bytes([content[18] ^ 0xFF]) + content[19:])
+    facts = {"sha256": digest_of(library), "architectures": ["9.0"]}
+    library.with_suffix(".json").write_text(json.dumps(facts))
+    if damage == "truncated":
+        library.write_bytes(content[: len(content) // 2])
+    assert not package.module(cuda=of_gpu).has_cuda()
+    said = [message for message in caplog.messages if str(library) in message]
+    assert len(said) == 1
+    assert ("damaged" if damage == "truncated" else "does not load") in said[0]
+    assert "answers are guessed" in caplog.messages[-1]
+    assert len(caplog.messages) == 2

@@ -133,9 +133,6 @@ class NativeModule:
         if self._session.loaded is None:
             if switched_off():
                 raise NativeBuildError(SWITCHED_OFF)
-            for library in self._places():
-                if library.exists() and not is_intact(library):
-                    _warn_once(f"{library} is damaged, and not loaded")
             problems: list[str] = []
             for library in self._existing():
                 problem = self._open(library)
@@ -301,6 +298,8 @@ class NativeModule:
                 held = architectures_of(library)
                 if not held or all(any(cuda_toolkit.runs_on(a, gpu) for a in held) for gpu in cuda_toolkit.gpus()):
                     yield library
+            elif library.exists():
+                _warn_once(f"{library} is damaged, and not loaded")
 
     def _places(self) -> Iterator[Path]:
         """Places of a library for this machine and these sources, best first."""

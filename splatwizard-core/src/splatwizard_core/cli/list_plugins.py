@@ -39,7 +39,7 @@ def gather() -> dict[str, Any]:
                 {"kind": e.kind, "name": e.name, "summary": e.summary, "target": e.target, **dict(e.declared)}
                 for e in plugins.provided_by(info)
             ],
-            "kernels": {} if info.foreign else _kernels(info.module, plugins.provided_by(info)),
+            "kernels": {} if info.foreign else _kernels(plugins.provided_by(info)),
             "refused": [{"kind": e.kind, "name": e.name, "reason": why} for e, why in plugins.refused_of(info)],
         }
         for info in plugins.plugins
@@ -52,12 +52,11 @@ def gather() -> dict[str, Any]:
     return {"plugins": rows, "clashes": clashes, "commands": [entry.name for entry in command_entries()]}
 
 
-def _kernels(plugin: str, entries: Iterable[Entry]) -> dict[str, str]:
-    """Collect the states of the native modules of a plugin's package: prebuilt, built, damaged, or reference."""
+def _kernels(entries: Iterable[Entry]) -> dict[str, str]:
+    """Collect the states of the native modules that entries compute with: prebuilt, built, damaged, or reference."""
     declared = [entry.declared.get("native") or () for entry in entries]
     targets = [target for each in declared for target in ([each] if isinstance(each, str) else each)]
-    ours = [target for target in dict.fromkeys(targets) if target.partition(".")[0] == plugin.partition(".")[0]]
-    modules = [pkgutil.resolve_name(target) for target in ours]
+    modules = [pkgutil.resolve_name(target) for target in dict.fromkeys(targets)]
     return {module.name: module.state()["state"] for module in modules if module.face}  # others need torch
 
 
