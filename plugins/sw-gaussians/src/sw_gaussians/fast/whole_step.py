@@ -135,18 +135,18 @@ class WholeStep:
         weights = self._weights_of(further, total)
         if further:
             with torch.no_grad():
-                weighted = torch.stack([term for _, term in further.values()]) * weights
-                total = total + weighted.sum()
-            parts |= dict(zip(further, weighted.unbind(), strict=True))
+                weighted = torch.stack([total, *(term for _, term in further.values())]) * weights
+                total = weighted.sum()
+            parts |= dict(zip(further, weighted[1:].unbind(), strict=True))
         pairs = [(x, by[name]) for name in by if (x := getattr(g, name, None)) is not None]
-        pairs += [(term, w.to(term.dtype)) for (_, term), w in zip(further.values(), weights.unbind(), strict=True)]
+        pairs += [(term, w.to(term.dtype)) for (_, term), w in zip(further.values(), weights[1:], strict=True)]
         learning = [(x, slope) for x, slope in pairs if x.requires_grad]
         run_backward(tuple(x for x, _ in learning), tuple(slope for _, slope in learning))
         return result, LossPack(total, parts)
 
     def _weights_of(self, terms: Mapping[str, tuple[float, Tensor]], like: Tensor) -> Tensor:
-        """Return the weights of terms in one tensor, that of the last step where they are the same."""
-        weights = [weight for weight, _ in terms.values()]
+        """Return 1 and the weights of terms in one tensor, that of the last step where they are the same."""
+        weights = [1.0, *(weight for weight, _ in terms.values())]
         if self._weights is None or self._weights[0] != weights or self._weights[1].device != like.device:
             self._weights = weights, like.new_tensor(weights)
         return self._weights[1]
