@@ -28,7 +28,7 @@ from sw_anchors.anchors import AnchorModel
 from sw_anchors.coded_anchors import CodedAnchors
 from sw_anchors.fast import loss as fast_loss
 from sw_anchors.fast import replay
-from sw_anchors.fast.whole_step import WholeAnchorStep
+from sw_anchors.fast.whole_step import Weighted, WholeAnchorStep, all_weighted
 from sw_anchors.growth import accumulate_anchor_statistics, adjust_anchors
 from sw_anchors.params import AnchorParams, CodedAnchorParams
 
@@ -44,10 +44,6 @@ if TYPE_CHECKING:
         SplatModel,
         View,
     )
-
-
-Weighted = tuple[float, "Tensor"]
-"""A weight and the scalar that it multiplies."""
 
 
 class AnchorStage(Stage):
@@ -184,19 +180,12 @@ class AnchorStage(Stage):
         total, *weighted = (fast_loss.weighted_sum if fast_enabled() else weighted_sum)(found.total, *terms.values())
         return LossPack(total, found.parts | dict(zip(terms, weighted, strict=True)))
 
-    def terms(
-        self, model: Any, result: RenderResult, step: int, *, volume: Tensor | None = None
-    ) -> dict[str, Weighted]:
-        """Return the terms beside the photometric loss: the mean volume (product of scales), and the extra ones.
-
-        volume  where it is known already
-        """
-        if volume is None:
-            assert result.inputs.scales is not None
-            mean = fast_loss.mean_product if fast_enabled() else mean_product
-            volume = mean(result.inputs.scales, self.counted(result))
-        terms = {"volume": (self.opt.loss.volume, volume), **self.extra_loss(model, result, step)}
-        return {name: t if isinstance(t, tuple) else (1.0, t) for name, t in terms.items()}
+    def terms(self, model: Any, result: RenderResult, step: int) -> dict[str, Weighted]:
+        """Return the terms beside the photometric loss: the mean volume (product of scales), and the extra ones."""
+        assert result.inputs.scales is not None
+        mean = fast_loss.mean_product if fast_enabled() else mean_product
+        volume = self.opt.loss.volume, mean(result.inputs.scales, self.counted(result))
+        return {"volume": volume, **all_weighted(self.extra_loss(model, result, step))}
 
     def whole_step(self, state: Any, view: View, camera: Any, background: Tensor) -> Any:
         return self._whole.of(self, state, view, camera, background) if type(self).loss is AnchorStage.loss else None

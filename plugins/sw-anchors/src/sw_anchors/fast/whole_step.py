@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 
 Step = tuple["RenderResult", "LossPack"]
 Weighted = tuple[float, "Tensor"]
+"""A weight and the scalar that it multiplies."""
 
 
 class WholeAnchorStep(WholeStep):
@@ -38,8 +40,7 @@ class WholeAnchorStep(WholeStep):
             with torch.no_grad():
                 volume, others = product_and_slopes(result.inputs.scales, count)
                 by["scales"] += others * (settings.volume / count)
-            found: dict[str, Weighted] = stage.terms(model, result, step, volume=volume)
-            return found
+            return {"volume": (settings.volume, volume), **all_weighted(stage.extra_loss(model, result, step))}
 
         found = self.through(inputs, options, settings.lambda_dssim, state, view, camera, background, terms)
         if found is not None:
@@ -49,6 +50,11 @@ class WholeAnchorStep(WholeStep):
         loss = stage.loss(model, view, result, background, step)
         loss.total.backward()  # type: ignore[no-untyped-call]
         return result, loss
+
+
+def all_weighted(terms: Mapping[str, Weighted | Tensor]) -> dict[str, Weighted]:
+    """Return terms of which each has a weight, if none then 1."""
+    return {name: term if isinstance(term, tuple) else (1.0, term) for name, term in terms.items()}
 
 
 def _the_same(last: RasterOptions | None, now: RasterOptions) -> RasterOptions:
