@@ -20,6 +20,7 @@ from splatwizard_core.training.plan import When, scaled
 if TYPE_CHECKING:
     from splatwizard_core.training.optimizer import SplatOptimizer
     from splatwizard_core.training.scheduler import Scheduler
+    from splatwizard_core.training.state import TrainingState
 
 
 class CameraSampler:
@@ -183,11 +184,6 @@ class Stage:
     def running(self, state: TrainingState) -> AbstractContextManager[Any]:
         """Enclose the loop of steps, of a new state or a resumed one; what it does around them is not training time."""
         return nullcontext()
-
-    def whole_step(
-        self, state: TrainingState, view: View, camera: Camera, background: Tensor
-    ) -> tuple[RenderResult, LossPack] | None:
-        """Draw a view and find loss and gradients in one, as the parts of a step do, faster; None: the parts shall."""
 
     def whole_step(self, state: Any, view: View, camera: Any, background: Tensor) -> Any:
         """Return a TrainingState's (RenderResult, LossPack), gradients made, faster than by parts; None: take these."""
