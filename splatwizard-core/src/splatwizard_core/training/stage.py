@@ -187,7 +187,6 @@ class Stage:
 
     def whole_step(self, state: Any, view: View, camera: Any, background: Tensor) -> Any:
         """Return a TrainingState's (RenderResult, LossPack), gradients made, faster than by parts; None: take these."""
-        return None
 
     def finish(self, model: SplatModel, scene: Scene) -> SplatModel:
         """Return the model that the next stage, or the encoder, gets; called once after the last step."""

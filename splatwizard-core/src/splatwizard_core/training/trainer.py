@@ -100,7 +100,6 @@ class Trainer:
             stop = state.pre.exec(step, state)
         self._check_rows()
         mark("pre")
-
         view = self._view = state.sampler.next(step)
         state.view = view.name
         background = self._background
