@@ -101,7 +101,7 @@ def draw(picture: Picture, tensors: Tensors, again: Again | None = None) -> Draw
     """
     check()
     call, flags, means = picture.call, picture.flags, tensors["means"]
-    count, device, most = len(means), means.get_device(), min(most_pairs(), NUMBERED)
+    count, device, most = means.shape[0], means.get_device(), min(most_pairs(), NUMBERED)
     splat_room = min(count, _rounded(_Recent.splats))
     room = min(most, _rounded(max(_Recent.pairs, 1)))
     real, byte = means.new_empty, functools.partial(means.new_empty, dtype=torch.uint8)
@@ -215,7 +215,7 @@ def project_backward(
         for name, x in tensors.items()
         if name in wanted and x is not None
     }
-    made |= {name: means.new_empty(len(means), 2) for name in ("grad2d", "absgrad2d") if name in wanted}
+    made |= {name: means.new_empty(means.shape[0], 2) for name in ("grad2d", "absgrad2d") if name in wanted}
 
     def fixed() -> dict[str, Any]:
         more = {"geom_indices": call.geom_indices, "visible": call.visible, "color_channels": picture.colors}
@@ -224,7 +224,7 @@ def project_backward(
         return {**settings, **more, **_adam("dc", done.get("sh_dc")), **_adam("rest", done.get("sh_rest"))}
 
     found = (_once(cuda_face.project_backward) if again is None or done else again["project_backward"])(
-        fixed, **_rows(len(means), again), **{name: x for name, x in tensors.items() if x is not None},
+        fixed, **_rows(means.shape[0], again), **{name: x for name, x in tensors.items() if x is not None},
         camera=tuple(call.camera), drawn=drawn, rows=rows, maps=maps,
         **{f"of_{name}": x.data_ptr() for name, x in made.items()},
     )  # fmt: skip

@@ -104,7 +104,7 @@ def gradients_on_cuda(
     call, shown, means = picture.call, kept[0].drawn, tensors["means"]
     statistics = {"grad2d": call.grad2d, "absgrad2d": call.absgrad2d}
     wanted = wanted | {name for name, buffer in statistics.items() if buffer is not None}
-    rows = cuda.blend_backward(picture, len(means), kept.pop(), by, again)
+    rows = cuda.blend_backward(picture, means.shape[0], kept.pop(), by, again)
     maps = by.get("maps") is not None
     found = cuda.project_backward(picture, tensors, shown, rows, wanted, updates, maps=maps, again=again)
     for name, buffer in statistics.items():

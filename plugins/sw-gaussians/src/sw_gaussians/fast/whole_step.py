@@ -6,6 +6,7 @@ time of the host, more than half a millisecond a step, which a GPU would wait fo
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, Protocol, TypeGuard, runtime_checkable
 
@@ -173,8 +174,7 @@ class WholeStep:
 def is_plain(model: SplatModel) -> TypeGuard[GaussianModel]:
     """Whether it is drawn as a GaussianModel, and its parameters all learn, without gradient yet and without hooks."""
     return (
-        isinstance(model, GaussianModel)
-        and all(getattr(type(model), name) is getattr(GaussianModel, name) for name in _DRAWN)
+        _is_drawn_plainly(type(model))
         and model._parameters.keys() == set(model.RAW)
         and all(
             p is not None
@@ -188,7 +188,10 @@ def is_plain(model: SplatModel) -> TypeGuard[GaussianModel]:
     )
 
 
-_DRAWN = "gaussians", "scales", "opacities"
+@functools.cache
+def _is_drawn_plainly(kind: type) -> bool:
+    drawn = "gaussians", "scales", "opacities"
+    return issubclass(kind, GaussianModel) and all(getattr(kind, x) is getattr(GaussianModel, x) for x in drawn)
 
 
 def _fits(truth: Tensor, camera: Camera) -> bool:
