@@ -18,7 +18,7 @@ from sw_gaussians import face
 from sw_gaussians.heap import trim
 from sw_gaussians.made_up_cameras import extent_of
 from sw_gaussians.merge_costs import Columns, closeness, columns_of, prices
-from sw_gaussians.merging import COEFFICIENTS_AT_ONCE, Splats, merge_groups, model_of, splats_of
+from sw_gaussians.merging import Splats, merge_groups, model_of, splats_of
 from sw_gaussians.morton import interleave
 from sw_gaussians.native import GAUSSIANS
 
@@ -154,7 +154,7 @@ def _blocks(values: Tensor) -> tuple[Tensor, ...]:
 
 
 def _at_once(rows: dict[str, int], values: Tensor) -> int:
-    """How many are worked on together where these values are."""
+    """Return the number that is worked on together where these values are."""
     return rows["cpu" if values.device.type == "cpu" else "cuda"]
 
 
