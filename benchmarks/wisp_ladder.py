@@ -9,12 +9,12 @@ are missing, unfinished or failed. Families, each at r1, r3, r5 and two points b
 
 wisp        as its preset has it
 half        --cap 1.6 times as many grown, 0.81 caps begin at factor 1: the worthier half
+fast        the same from a scene of preset `fast` of 3dgs: of few photographs the better one
 
 Rungs, at r3 and once: half with
 
 settled     the last quarter of the grown scene without noise and loss terms, and the mean of its last tenth
 long        30,000 steps of growing
-fast        a scene of preset `fast` of 3dgs
 slow        step sizes of a training that goes on: positions and latents a tenth, shapes, opacities and colours a third
 view        latents alone a tenth
 latents     steps of the latents by what the pictures depend on
@@ -53,7 +53,6 @@ RUNGS: Mapping[str, Sequence[str]] = {
         "pretrained.fast.average=0.1",
     ],
     "long": ["pretrained.iterations=30000"],
-    "fast": ["pretrained.preset=fast", "pretrained.iterations=9000"],
     "slow": [
         f"lr.{name}.{end}={value}"
         for name, pair in ({"means": (1.6e-6, 1.6e-7)} | SLOW | TENTH).items()
@@ -66,14 +65,15 @@ RUNGS: Mapping[str, Sequence[str]] = {
 
 def families(cap: int) -> dict[str, list[str]]:
     """Family -> its values."""
-    return {"wisp": [], "half": [f"{GROWN}.cap={round(1.6 * cap)}", f"budget.cap={round(0.54 * cap)}"]}
+    half = [f"{GROWN}.cap={round(1.6 * cap)}", f"budget.cap={round(0.54 * cap)}", "budget.cap_factor=1"]
+    return {"wisp": [], "half": half, "fast": [*half, "pretrained.preset=fast", "pretrained.iterations=9000"]}
 
 
 def points(family: str, scene: str, images: str, seed: int, values: Sequence[str]) -> list[Cell]:
     """A family at its rate points and the two beyond."""
     found = [Cell(family, "wisp", scene, rate, seed, images=images, sets=tuple(values)) for rate in RATES]
     for name, (weight, factor, eta) in BEYOND.items():
-        own = (f"rate_term.lambda_={weight}", f"budget.cap_factor={factor}", f"positions.eta={eta}")
+        own = (f"budget.cap_factor={factor}", f"rate_term.lambda_={weight}", f"positions.eta={eta}")
         found.append(Cell(f"{family}-{name}", "wisp", scene, "r5", seed, images=images, sets=(*values, *own)))
     return found
 

@@ -398,7 +398,7 @@ def test_the_ladder_of_wisp_has_its_families_beside_the_baselines(monkeypatch, b
     status, fake = bench(ladder, tmp_path / "out", *words)
     told = capsys.readouterr().out
     assert (status, len(fake.commands)) == (0, 1)
-    assert "9 cells: 9 ran" in told
+    assert "13 cells: 13 ran" in told
     assert "half over hac-plus" in told
     beyond = {cell.label: cell.sets for cell in ladder.cells_of("demo:tiny", "", 1000, 1)["half"]}
     assert "rate_term.lambda_=1.25e-05" in beyond["half-high"]
