@@ -74,7 +74,8 @@ def points(family: str, scene: str, images: str, seed: int, values: Sequence[str
     found = [Cell(family, "wisp", scene, rate, seed, images=images, sets=tuple(values)) for rate in RATES]
     for name, (weight, factor, eta) in BEYOND.items():
         own = (f"budget.cap_factor={factor}", f"rate_term.lambda_={weight}", f"positions.eta={eta}")
-        found.append(Cell(f"{family}-{name}", "wisp", scene, "r5", seed, images=images, sets=(*values, *own)))
+        kept = [each for each in values if not each.startswith("budget.cap_factor=")]
+        found.append(Cell(f"{family}-{name}", "wisp", scene, "r5", seed, images=images, sets=(*kept, *own)))
     return found
 
 
