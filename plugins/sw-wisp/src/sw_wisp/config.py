@@ -21,10 +21,7 @@ class Budget(Params):
 
 
 class RateTerm(Params):
-    """The bits in the loss: lambda times bits of the whole file over the pixels of all training pictures, in hundreds.
-
-    So a bit is as dear as the errors that it can take away: of more pictures, and of larger ones, it is cheaper.
-    """
+    """The bits in the loss: lambda times bits of the whole file over the pixels of all training pictures, over 100."""
 
     DEFAULTS: ClassVar[int] = 1
 

@@ -34,10 +34,7 @@ looks the same."""
 
 
 def kept_rows(worth: Worth, views: Sequence[View], config: WispConfig) -> Tensor:
-    """Return the rows [M] int64, ascending, that begin: the worthiest, as many as the cap lets.
-
-    As many go before as there are without which the pictures are as good, up to a share.
-    """
+    """Return the rows [M] int64, ascending, that begin: the worthiest that the cap lets, less a number that do harm."""
     n = len(worth.change)
     cap = round(HEAD_ROOM * (config.budget.cap or cap_for(views)) * config.budget.cap_factor)
     needless = min(int((worth.cost <= 0).sum()), int(config.budget.worthless * n))

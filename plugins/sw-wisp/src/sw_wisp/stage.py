@@ -46,14 +46,12 @@ from sw_wisp.positions import MARGIN, levels_by_cost, middle_scales
 from sw_wisp.prefixes import chosen_order, fitted_swell, packet_bits, psnr_of_prefixes
 from sw_wisp.removal import copy_some, unworthy
 from sw_wisp.rounding import FINAL, HARD, NOISE, SOFT
-from sw_wisp.worth import Worth, loss_of_error, slopes, worth
+from sw_wisp.worth import loss_of_error, slopes, worth
 
 NETWORKS = ("network", "rate")
 NETWORK_EPS = 1e-8
 FITS = 2
 """Times that the networks are fitted before the first bits are counted, each to what the one before left."""
-PRICED_VIEWS = 100
-"""Training pictures that the lambda of the rate points are for: a bit is paid once, errors show in all of them."""
 SENSITIVE_VIEWS = 64
 """Most views that squared slopes are measured over inside a training."""
 
@@ -78,7 +76,7 @@ class WispStage(Stage):
     def __init__(self, opt: WispConfig) -> None:
         super().__init__(opt)
         self.config = opt
-        self._pixels = 1.0  # of all training pictures, in hundreds of pictures
+        self._pixels = 1.0  # of all training pictures over 100
 
     # Bounds of this run
 
@@ -294,7 +292,7 @@ class WispStage(Stage):
         before, prune = model.num_rows, self.config.prune
         background = scene.background.to(model.device)
         with still(model):
-            found = self.worth(model, cameras, rasterizer, background)
+            found = worth(model, cameras, rasterizer, background, lambda_dssim=self.config.loss.lambda_dssim)
             bits = model.bits().sum(1) + model.place_bits()
         doomed = unworthy(found.loss_rise, bits, self.price(), prune.share)
         if len(doomed) == before:
@@ -342,10 +340,6 @@ class WispStage(Stage):
         model.layers = replace(model.layers, swell=swell)
 
     # Parts
-
-    def worth(self, model: SplatModel, views: list[View], rasterizer: Rasterizer, background: Tensor) -> Worth:
-        """Return what each splat is worth to all training views."""
-        return worth(model, views, rasterizer, background, lambda_dssim=self.config.loss.lambda_dssim)
 
     def loss_of_error(self, model: SplatModel, views: list[View], rasterizer: Rasterizer, background: Tensor) -> float:
         """Return how much the loss of all training views rises with their squared error."""
@@ -442,8 +436,8 @@ class WispStage(Stage):
 
 
 def priced_pixels(views: Sequence[View]) -> float:
-    """Return the pixels that bits are paid by: of all training pictures, in hundreds of pictures."""
-    return sum(view.camera.width * view.camera.height for view in views) / PRICED_VIEWS
+    """Return the pixels that bits are paid by: of all training pictures over 100; lambda is that of a hundred."""
+    return sum(view.camera.width * view.camera.height for view in views) / 100
 
 
 def some_views(views: list[View], draws: torch.Generator) -> list[View]:
