@@ -112,13 +112,9 @@ def _unpack_meta(reader: ByteReader) -> np.ndarray:
 
 def table_bits(codes: np.ndarray) -> float:
     """Roughly what a table costs in the file: used for choosing, never for reporting."""
-    return float(table_steps(codes, [0]).sum())
+    return float(step_bits(np.abs(np.diff(codes, prepend=0))).sum())
 
 
-def table_steps(codes: np.ndarray, starts: Sequence[int]) -> np.ndarray:
-    """The same by code, of tables that begin at these places."""
-    steps = np.diff(codes, prepend=0)
-    if len(codes):
-        steps[starts] = codes[starts]
-    steps = np.abs(steps)
+def step_bits(steps: np.ndarray) -> np.ndarray:
+    """The same of each step >= 0 from one code to the next."""
     return np.where(steps == 0, 1.0, 2.5 + np.log2(1 + steps))

@@ -22,7 +22,7 @@ from sw_codecs.bits.packing import (
     write_varint,
     zigzag,
 )
-from sw_codecs.coders.count_tables import code_counts, count_codes, table_steps
+from sw_codecs.fast.column_costs import costs, histogram, least_bits
 
 CONSTANT, BINS, MAGNITUDES, DICTIONARY = 0, 1, 2, 3
 DIFFERENCES = 0x10
@@ -131,35 +131,6 @@ def _candidates(distinct: np.ndarray, counts: np.ndarray) -> list[ColumnPlan]:
     return plans
 
 
-def _costs(plans: list[ColumnPlan], distinct: np.ndarray, counts: np.ndarray) -> list[tuple[ColumnPlan, float]]:
-    """Plans with their table sizes filled in, and their estimated bits; none is a constant.
-
-    Their tables lie one after the other: numbers so few take longer to call than to work on.
-    """
-    parts = [plan.split(distinct) for plan in plans]
-    sizes = [int(classes.max()) + 1 for classes, *_ in parts]
-    ends = np.cumsum(sizes).tolist()
-    starts = [0, *ends[:-1]]
-    places = np.concatenate([classes + start for (classes, *_), start in zip(parts, starts, strict=True)])
-    histogram = np.bincount(places, np.tile(counts, len(plans))).astype(np.int64)
-    codes = count_codes(histogram)
-    stored = code_counts(codes)
-    used = np.flatnonzero(histogram)
-    used_ends = np.searchsorted(used, ends).tolist()
-    totals = [int(stored[start:end].sum()) for start, end in zip(starts, ends, strict=True)]
-    total = np.repeat(totals, np.diff(used_ends, prepend=0))
-    symbols = histogram[used] * np.log2(total / stored[used])
-    tables = table_steps(codes, starts)
-    found, first = [], 0
-    for plan, (_, _, extra), start, end, last in zip(plans, parts, starts, ends, used_ends, strict=True):
-        bits = float(symbols[first:last].sum()) + float(tables[start:end].sum())
-        bits += 8.0 * len(plan.pack()) if plan.kind == DICTIONARY else 0.0
-        bits += float(counts.sum() * plan.parameter if extra is None else (counts * extra).sum())
-        found.append((replace(plan, size=end - start), bits))
-        first = last
-    return found
-
-
 def choose_plan(column: np.ndarray) -> ColumnPlan:
     """The plan with the smallest estimated size for one column of int64 values."""
     if len(column) == 0:
@@ -167,28 +138,12 @@ def choose_plan(column: np.ndarray) -> ColumnPlan:
     best, least = ColumnPlan(CONSTANT, int(column[0])), float("inf")
     for first in (None, int(column[0])):
         residuals = replace(best, first=first).residuals(column)
-        distinct, counts = _histogram(residuals)
+        distinct, counts = histogram(residuals)
         if len(distinct) == 1:
-            if least > 0:
-                best, least = ColumnPlan(CONSTANT, int(distinct[0]), first=first), 0.0
-        elif (1 - 1e-9) * _entropy(counts) < least:  # no plan is below it
+            return ColumnPlan(CONSTANT, int(distinct[0]), first=first)
+        if least_bits(counts) < least:
             plans = [replace(plan, first=first) for plan in _candidates(distinct, counts)]
-            for plan, bits in _costs(plans, distinct, counts):
+            for plan, bits in costs(plans, distinct, counts):
                 if bits < least:
                     best, least = plan, bits
     return best
-
-
-def _entropy(counts: np.ndarray) -> float:
-    """Bits of values that occur so often, by their own shares."""
-    return float((counts * np.log2(counts.sum() / counts)).sum())
-
-
-def _histogram(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distinct values in ascending order and how often each occurs."""
-    low, high = int(values.min()), int(values.max())
-    if high - low < max(1 << 16, 4 * len(values)):  # counting beats sorting
-        counts = np.bincount(values - low, minlength=1)
-        present = np.flatnonzero(counts)
-        return present + low, counts[present]
-    return np.unique(values, return_counts=True)
