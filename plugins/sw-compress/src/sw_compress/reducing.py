@@ -85,14 +85,13 @@ class Reduction:
         give_back()  # what drawing holds on to
         rows = self.pruning.rows(self.kept(count, power))
         if len(rows) > count and power < 1:
-            merged, weights = merged_by(self.model, rows, count, self.weights()[rows])
+            # Of some that merged so little is left that nothing is drawn.
+            merged, weights = merged_by(self.model, rows, count, self.weights()[rows], faintest=FAINTEST)
             found = like(self.model, merged)
-            drawn = found.opacity_logits >= FAINTEST  # of some that merged so little is left that nothing is drawn
-            if not bool(drawn.all()):
-                found, weights = select(found, drawn), weights[drawn]
         else:
             found, weights = select(self.model, rows), self.pruning.importance[rows]
         setattr(found, IMPORTANCE, weights)
+        give_back()
         return found
 
     def weights(self) -> torch.Tensor:

@@ -77,13 +77,17 @@ def splats_of(model: GaussianModel, rows: Tensor | None = None) -> Splats:
 
 def model_of(splats: Splats, rows: Tensor, like: GaussianModel) -> GaussianModel:
     """A model in float32 of some Gaussians, fixed, with what the file of `like` told; overwrites their SH."""
-    opacities = splats.opacities[rows].double().clamp(1e-6, 1 - 1e-6)
     scales = splats.scales[rows].double().clamp(1e-38, 3e38)
     dc, rest = sh_of(splats.sh, rows)
-    raw = (splats.means[rows], dc, rest, torch.logit(opacities), scales.log(), splats.quats[rows])
+    raw = (splats.means[rows], dc, rest, logits_of(splats.opacities[rows]), scales.log(), splats.quats[rows])
     model = GaussianModel(*(values.float() for values in raw))
     model.origin = like.origin
     return model.eval().requires_grad_(False)
+
+
+def logits_of(opacities: Tensor) -> Tensor:
+    """Logits [N] float32 of opacities [N], within +-13.8."""
+    return torch.logit(opacities.double().clamp(1e-6, 1 - 1e-6)).float()
 
 
 def sh_of(sh: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:

@@ -18,7 +18,7 @@ from sw_gaussians import face
 from sw_gaussians.heap import trim
 from sw_gaussians.made_up_cameras import extent_of
 from sw_gaussians.merge_costs import Columns, closeness, columns_of, prices
-from sw_gaussians.merging import Splats, merge_groups, model_of, splats_of
+from sw_gaussians.merging import Splats, logits_of, merge_groups, model_of, splats_of
 from sw_gaussians.morton import interleave
 from sw_gaussians.native import GAUSSIANS
 
@@ -60,14 +60,17 @@ def merged_to(
 
 @torch.no_grad()
 def merged_by(
-    model: GaussianModel, rows: Tensor, count: int, significance: Tensor, *, widen: bool = False
-) -> tuple[GaussianModel, Tensor]:
+    model: GaussianModel, rows: Tensor, count: int, significance: Tensor, *, widen: bool = False,
+    faintest: float = -math.inf,
+) -> tuple[GaussianModel, Tensor]:  # fmt: skip
     """As `merged_to` of some rows [M], with the significance of each Gaussian of the result.
 
     significance    [M] of these rows; of the result it is the sum over what it stands for
+    faintest        logit of the opacity below which a Gaussian is left out in the end
     """
     splats, weights, left = _reduced(model, rows, count, significance, widen)
     assert weights is not None  # they were given
+    left = left[logits_of(splats.opacities[left]) >= faintest]
     found = weights[left].to(significance) * significance.median().clamp_min(1e-30)
     return model_of(splats, left, model), found
 
