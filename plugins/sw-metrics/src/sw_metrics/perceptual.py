@@ -142,9 +142,9 @@ def not_available(folder: Path | None) -> str | None:
     absent = [b.file_name for net, b in BACKBONES.items() if find_weights(net, folder) is None]
     if not absent:
         return None
+    beside = BACKBONES["vgg"].address.rpartition("/")[0]
     return (
-        f"LPIPS is not available without its weights, its values will be null: {fetch_command()}, or bring "
-        f"{' and '.join(absent)} from {BACKBONES['vgg'].address.rpartition('/')[0]}/ and give "
+        f"LPIPS is not available without {' and '.join(absent)}: {fetch_command()}, or from {beside}/ into DIR and "
         "--set metrics.lpips.weights=DIR"
     )
 

@@ -140,10 +140,10 @@ def _print(facts: dict[str, Any]) -> None:
     shared.print_table([], rows, title=f"{name} on {facts['scene']}, protocol {facts['protocol']['id']}")
     if facts["prefixes"]:
         names = list(facts["prefixes"][0]["metrics"])
-        cells = [
-            [f"{cut['packets']}", f"{cut['bytes']:,}", *(f"{cut['metrics'].get(n, math.nan):.4f}" for n in names)]
-            for cut in facts["prefixes"]
-        ]
+        cells = [[f"{cut['packets']}", f"{cut['bytes']:,}", *(f"{cut['metrics'].get(n, math.nan):.4f}" for n in names)]
+                 for cut in facts["prefixes"]]  # fmt: skip
         shared.print_table(["packets", "bytes", *names], cells, right=2 + len(names))
-    for name, reason in facts["unknown"].items():
-        click.echo(f"{name.removeprefix('metrics.').removesuffix('.mean')}: {short_reason(reason)}")
+    reasons = {name: short_reason(reason) for name, reason in facts["unknown"].items()}
+    for reason in dict.fromkeys(reasons.values()):
+        those = (each.removeprefix("metrics.").removesuffix(".mean") for each in reasons if reasons[each] == reason)
+        click.echo(f"{', '.join(those)}: {reason}")
