@@ -212,3 +212,12 @@ def test_a_sample_is_of_runs_from_everywhere():
     assert rows[0] < 1_000
     assert rows[-1] > 9_000
     assert torch.equal(sample_rows(50, 100, 10), torch.arange(50))
+
+
+def test_tiles_have_as_many_as_if_the_whole_merged_at_once(scene):
+    light = scene.light
+    weights = torch.where(torch.arange(light.num_rows) < scene.limits[1], 1.0, 1e-4)  # the first tile matters
+    counts = large.count_by_tile(scene, torch.arange(light.num_rows), 1_000, weights)
+    assert sum(counts) <= 1_000
+    assert counts[0] > 0.8 * scene.limits[1]
+    assert counts[1] < 0.5 * (light.num_rows - scene.limits[1])

@@ -28,7 +28,7 @@ from sw_compress.allocation import of_error
 from sw_compress.among import Among, coarse, sample_rows, without
 from sw_compress.coders import FIXED_BYTES, Quantized
 from sw_compress.filling import AIM, MOST_ENCODES
-from sw_compress.large_scene import LargeScene, read_scene
+from sw_compress.large_scene import Curve, LargeScene, read_scene
 from sw_compress.measuring import Errors
 from sw_compress.ply_blocks import PlyBlocks, blocks_of
 from sw_compress.pruning import Pruning
@@ -316,7 +316,8 @@ class _Work:
             rows = self._pruning.rows(reduction.kept(count, power) if count < whole else whole)
         with self.asked.stages.timed("reduce"):
             importance = list[Tensor]()
-            tiles = _reduced(scene, rows, min(count / len(rows), 1.0), power, reduction, importance, self.asked)
+            counts = count_by_tile(scene, rows, count if power < 1 else len(rows), reduction.weights())
+            tiles = _reduced(scene, rows, counts, reduction, importance, self.asked)
             found = LargeScene.of_tiles(tiles, self._shelf())
             self.facts |= {"pruned": whole - len(rows), "merged": len(rows) - found.num_rows}
             scene.shelf.close()
@@ -329,11 +330,19 @@ def keeps_unseen(asked: Asked) -> bool:
     return not asked.drop_unseen and asked.given is None and asked.gaussians is None
 
 
+def count_by_tile(scene: LargeScene, rows: Tensor, count: int, weights: Tensor) -> list[int]:
+    """Gaussians of each tile, at most, after neighbours have merged: as many as if the whole merged at once."""
+    if count >= len(rows):
+        return [scene.num_rows for _ in scene.tiles]
+    curve = Curve(scene.light.means.detach(), scene.limits[:-1])
+    merged = merged_by(scene.light, rows, count, weights[rows])[0].means.detach()
+    return torch.bincount(curve.parts(merged), minlength=len(scene.tiles)).tolist()
+
+
 def _reduced(
-    scene: LargeScene, rows: Tensor, share: float, power: float, reduction: Reduction, importance: list[Tensor],
-    asked: Asked,
-) -> Iterator[GaussianModel]:  # fmt: skip
-    """Tiles of the rows that stay, the share of them that is left when others have merged; fills `importance`."""
+    scene: LargeScene, rows: Tensor, counts: list[int], reduction: Reduction, importance: list[Tensor], asked: Asked
+) -> Iterator[GaussianModel]:
+    """Tiles of the rows that stay, in which neighbours merge until `counts` are left; fills `importance`."""
     weights, known = reduction.weights(), reduction.pruning.importance
     with track("reduce", total=len(scene.tiles), unit="tiles") as bar:
         for tile in scene.tiles:
@@ -343,8 +352,8 @@ def _reduced(
                 continue
             model = scene.tile(tile, own - part.start)
             model = model if asked.sh_degree is None else with_degree(model, asked.sh_degree)
-            count, of = max(1, round(share * len(own))), known[own]
-            if count < len(own) and power < 1:
+            count, of = max(1, counts[tile]), known[own]
+            if count < len(own):
                 whole = torch.arange(len(own), device=own.device)
                 merged, of = merged_by(model, whole, count, weights[own])
                 model = like(model, merged)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
-from sw_gaussians.morton import morton_order
+from sw_gaussians.morton import interleave, morton_order
 from sw_gaussians.surfels import refuse_surfels
 from sw_reference.spherical_harmonics import sh_colors
 from torch import Tensor
@@ -31,7 +31,32 @@ TILE = 1 << 20
 MOST_TILES = 64
 """As many packets as a file can have; a larger scene has larger tiles."""
 ROWS_AT_ONCE = 1 << 16
-"""Rows whose colours are found together."""
+"""Rows whose colours, or places along a curve, are found together."""
+BITS = 20
+"""Of a coordinate along a curve."""
+
+
+class Curve:
+    """A Morton curve through points, in parts.
+
+    points  [N,3] along it
+    starts  first row of each part
+    """
+
+    def __init__(self, points: Tensor, starts: Sequence[int]) -> None:
+        self._low = points.amin(0).double()
+        self._step = (2**BITS - 1) / (points.amax(0).double() - self._low).clamp_min(1e-30)
+        self._starts = self._codes(points[list(starts)]).sort().values
+
+    def parts(self, points: Tensor) -> Tensor:
+        """The part [M] that each of some points [M,3] lies in."""
+        codes = torch.cat([self._codes(part) for part in points.split(ROWS_AT_ONCE)])
+        return (torch.searchsorted(self._starts, codes, right=True) - 1).clamp_min(0)
+
+    def _codes(self, points: Tensor) -> Tensor:
+        cells = ((points.double() - self._low) * self._step).long().clamp(0, 2**BITS - 1)
+        found: Tensor = interleave(cells)
+        return found
 
 
 @dataclass
