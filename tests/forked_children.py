@@ -40,13 +40,17 @@ MODULES = (
     "sw_doctor.child_check",
 )  # fmt: skip
 PLAIN = (
-    "SW_", "SPLATWIZARD_", "PYTHONPATH", "PYTEST_", "COV_", "TEST_", "TMPDIR", "HOME", "XDG_", "TORCH_HOME", "COLUMNS",
+    "SW_", "_SW_", "SPLATWIZARD_", "PYTHONPATH", "PYTEST_", "COV_", "TEST_", "TMPDIR", "HOME", "XDG_", "TORCH_HOME", "COLUMNS",
     "PATH", "CXX", "TOY_", "OMP_NUM_THREADS", "PYTHONDONTWRITEBYTECODE", "TORCHINDUCTOR_", "CUBLAS_WORKSPACE_CONFIG",
+    "GLIBC_TUNABLES",
 )  # fmt: skip
 """Variables that mean the same to a process that reads them late; any other difference needs a new interpreter.
 
-The last two are set by a training: without them every run after the first training of a session would get one.
+TORCHINDUCTOR_ and CUBLAS_WORKSPACE_CONFIG are set by a training: without them every run after the first training of a
+session would get one.
 """
+BIG_PAGES = {"GLIBC_TUNABLES": "glibc.malloc.hugetlb=1"}
+"""Lets the server's memory lie in big pages, of which a fork copies few entries."""
 THEIRS = (
     "torch", "numpy", "pydantic", "pydantic.dataclasses", "rich.console", "safetensors.torch", "PIL.Image", "jinja2",
     "scipy.ndimage", "scipy.spatial", "constriction", "plyfile", "zlib_ng.zlib_ng", "tomli_w",
@@ -237,7 +241,7 @@ class ForkServer:
                     [sys.executable, __file__, str(theirs.fileno())],
                     pass_fds=[theirs.fileno()],
                     stdin=subprocess.DEVNULL,
-                    env=self._environment,  # not that of the test which asks first
+                    env={**self._environment, **BIG_PAGES},  # not that of the test which asks first
                 )
         return self._socket
 
@@ -338,23 +342,32 @@ def _serve(connection: socket.socket) -> tuple[dict[str, Any], int]:
     The server itself never returns.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # whoever asked is interrupted, and its child
+    ends_of: dict[int, tuple[int, int]] = {}  # descriptor of a child -> its pid, and where its status is told
     while True:
+        ready = select.select([connection, *ends_of], [], [])[0]
+        for child in set(ready) & set(ends_of):
+            pid, end = ends_of.pop(child)
+            with contextlib.suppress(BrokenPipeError):  # nobody wants to know any more
+                os.write(end, str(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])).encode())
+            os.close(child)
+            os.close(end)
+        if connection not in ready:
+            continue
         _, files, _, _ = socket.recv_fds(connection, 16, 6)
         if not files:
             os._exit(0)  # the session has ended
         text, asking, *ends = files
-        if os.fork() == 0:  # one process waits for the child and tells its status, so that the server need not
-            child = os.fork()
-            if child == 0:
-                break
-            os.write(ends[3], f"{child} ".encode())
-            os.write(ends[3], str(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])).encode())
-            os._exit(0)
-        for file in files:
+        pid = os.fork()
+        if pid == 0:
+            break
+        with contextlib.suppress(BrokenPipeError):
+            os.write(ends[3], f"{pid} ".encode())
+        ends_of[os.pidfd_open(pid)] = pid, ends[3]
+        for file in files[:-1]:
             os.close(file)
-        with contextlib.suppress(ChildProcessError):
-            while os.waitpid(-1, os.WNOHANG)[0]:
-                pass
+    for child, (_, end) in ends_of.items():
+        os.close(child)
+        os.close(end)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     connection.close()
     with open(text, "rb") as request:
@@ -420,6 +433,7 @@ def _become(content: dict[str, Any], asking: int, ours: list[str]) -> None:
 
 if __name__ == "__main__":
     import gc
+    import weakref
 
     keep_freed_memory()
     for name in THEIRS:
@@ -427,6 +441,8 @@ if __name__ == "__main__":
     sys.meta_path.insert(0, Imported(OURS))
     gc.freeze()  # else the children's first collections copy all its memory
     gc.set_threshold(SELDOM)
+    for finalizer in list(weakref.finalize._registry):  # type: ignore[attr-defined]
+        finalizer.atexit = False  # torch would take its operators apart in each child
     given = [os.path.abspath(path) for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
     ours = [path for path in sys.path[1:] if path not in given]  # the first is this file's folder
     _become(*_serve(socket.socket(fileno=int(sys.argv[1]))), ours)

@@ -79,7 +79,7 @@ READER = """
                     # A checkpoint, or anything of a run that starts again, may be gone by now; half of one may not be.
                     if path.exists() and "is missing" not in str(error):
                         sys.exit(f"{path}: {type(error).__name__}: {error}")
-        time.sleep(0.01)
+        time.sleep(0.1)
     print(json.dumps({"looks": looks, **counts}))
 """
 
