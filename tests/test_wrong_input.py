@@ -338,6 +338,7 @@ ROWS = [
 @pytest.fixture(scope="module")
 def things(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     root = tmp_path_factory.mktemp("things")
+    load_plugins.cache_clear()  # of other surroundings
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SPLATWIZARD_NATIVE", "0")  # wrong input is found before anything is compiled
         make_things(root)
@@ -345,7 +346,7 @@ def things(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 @pytest.fixture
-def surroundings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
+def surroundings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     """An empty working folder, and no variable of ours but those that a row sets."""
     (tmp_path / "work").mkdir()
     monkeypatch.chdir(tmp_path / "work")
@@ -354,8 +355,7 @@ def surroundings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[py
             monkeypatch.delenv(name)
     # What is not refused must not train for hours before the test fails.
     monkeypatch.setattr("splatwizard_core.training.trainer.Trainer.run", _began, raising=True)
-    yield monkeypatch
-    load_plugins.cache_clear()
+    return monkeypatch
 
 
 def _began(*_: object, **__: object) -> None:
@@ -390,17 +390,19 @@ def test_there_are_rows_for_every_command():
 
 
 @pytest.mark.parametrize("row", ROWS, ids=str)
-def test_wrong_input(row: Row, things: Path, tmp_path: Path, surroundings, capsys: pytest.CaptureFixture[str]):
+def test_wrong_input(row: Row, things: Path, tmp_path: Path, surroundings, capsys: pytest.CaptureFixture[str], request):
     if not row.root and os.access(things / "locked.swz", os.R_OK):
         pytest.skip("the system refuses root nothing")
     if "--device cuda" in row.line and torch.cuda.is_available():
         pytest.skip("there is a CUDA device here")
+    if row.env:  # the plugins of these surroundings alone
+        load_plugins.cache_clear()
+        request.addfinalizer(load_plugins.cache_clear)
     for name, value in row.env.items():
         surroundings.setenv(name, filled(value, things, tmp_path))
         if name == "PYTHONPATH":
             surroundings.syspath_prepend(os.environ[name])
             surroundings.setattr(sys, "dont_write_bytecode", True)  # beside those modules it would be a new file
-        load_plugins.cache_clear()
     before = tree(things, tmp_path)
     status = main(shlex.split(filled(row.line, things, tmp_path)))
     told = capsys.readouterr()

@@ -35,27 +35,21 @@ def whole(toy, trained_once):
     return outcome
 
 
-@pytest.mark.parametrize("stop", [44, 45, 99])
-def test_stopped_and_resumed_equals_one_go(toy, whole, tmp_path, stop):
-    with pytest.raises(TrainingStopped):
-        toy.train(iterations=100, directory=tmp_path, stop_after=stop)
+def test_stopped_and_resumed_anywhere_equals_one_go(toy, whole, tmp_path):
+    """Before, at and after densification, and before the last step."""
+    for stop in (30, 44, 45, 99):
+        with pytest.raises(TrainingStopped):
+            toy.train(iterations=100, directory=tmp_path, stop_after=stop)
     resumed = toy.train(iterations=100, directory=tmp_path)
     assert resumed.model.digest() == whole.model.digest()
     assert resumed.figures.steps == 100
 
 
-def test_many_stops_equal_one_go(toy, whole, tmp_path):
-    for stop in range(30, 100, 30):
-        with pytest.raises(TrainingStopped):
-            toy.train(iterations=100, directory=tmp_path, stop_after=stop)
-    assert toy.train(iterations=100, directory=tmp_path).model.digest() == whole.model.digest()
-
-
 def test_a_second_run_equals_the_first_and_another_seed_does_not(toy, whole):
     torch.manual_seed(99)
     assert toy.train(iterations=100).model.digest() == whole.model.digest()
-    other = toy.train(iterations=100, ppl=PipelineParams(seed=1))
-    assert other.model.digest() != whole.model.digest()
+    one, other = (toy.train(iterations=5, ppl=PipelineParams(seed=seed)) for seed in (0, 1))
+    assert one.model.digest() != other.model.digest()
 
 
 def test_training_leaves_the_callers_generators_alone(toy):
@@ -68,7 +62,7 @@ def test_training_leaves_the_callers_generators_alone(toy):
     seed()
     expected = draw()
     seed()
-    toy.train(iterations=60)
+    toy.train(iterations=10)
     assert draw() == expected
 
 
@@ -123,14 +117,14 @@ def test_a_killed_run_goes_on_from_its_last_checkpoint(toy, whole, tmp_path):
 
 def test_the_log_of_a_resumed_run_has_each_step_once(toy, tmp_path):
     def fail(_, record):
-        if record.step == 77:
+        if record.step == 37:
             raise RuntimeError
 
-    ppl = PipelineParams(checkpoint_every=50)
+    ppl = PipelineParams(checkpoint_every=20)
     with pytest.raises(RuntimeError):
-        toy.train(iterations=100, directory=tmp_path / "a", ppl=ppl, on_step=fail)
-    toy.train(iterations=100, directory=tmp_path / "a", ppl=ppl)
-    toy.train(iterations=100, directory=tmp_path / "b", ppl=ppl)
+        toy.train(iterations=50, directory=tmp_path / "a", ppl=ppl, on_step=fail)
+    toy.train(iterations=50, directory=tmp_path / "a", ppl=ppl)
+    toy.train(iterations=50, directory=tmp_path / "b", ppl=ppl)
     assert (tmp_path / "a" / "log.jsonl").read_text() == (tmp_path / "b" / "log.jsonl").read_text()
 
 
@@ -238,27 +232,27 @@ def test_training_works_outside_the_main_thread(toy):
     from concurrent.futures import ThreadPoolExecutor
 
     with ThreadPoolExecutor(1) as pool:
-        outcome = pool.submit(toy.train, iterations=60).result()
-    assert outcome.model.digest() == toy.train(iterations=60).model.digest()
+        outcome = pool.submit(toy.train, iterations=20).result()
+    assert outcome.model.digest() == toy.train(iterations=20).model.digest()
 
 
-def test_a_finished_run_is_only_loaded(toy, whole, tmp_path):
-    first = toy.train(iterations=100, directory=tmp_path)
+def test_a_finished_run_is_only_loaded(toy, tmp_path):
+    first = toy.train(iterations=30, directory=tmp_path)
     steps = []
-    again = toy.train(iterations=100, directory=tmp_path, on_step=lambda _, r: steps.append(r.step))
+    again = toy.train(iterations=30, directory=tmp_path, on_step=lambda _, r: steps.append(r.step))
     assert steps == []
-    assert again.model.digest() == first.model.digest() == whole.model.digest()
+    assert again.model.digest() == first.model.digest()
     assert again.figures == first.figures
     assert again.plan == first.plan
     with pytest.raises(TrainingStopped):
         # Stopping at the very end of the last stage is finishing; before, it is not.
-        toy.train(iterations=100, directory=tmp_path / "b", stop_after=99)
-    toy.train(iterations=100, directory=tmp_path / "b", stop_after=100)
+        toy.train(iterations=30, directory=tmp_path / "b", stop_after=29)
+    toy.train(iterations=30, directory=tmp_path / "b", stop_after=30)
 
 
 def test_without_resuming_a_run_starts_again(toy, whole, tmp_path):
     with pytest.raises(TrainingStopped):
-        toy.train(iterations=100, directory=tmp_path, stop_after=50)
+        toy.train(iterations=100, directory=tmp_path, stop_after=12)
     steps = []
     outcome = toy.train(iterations=100, directory=tmp_path, resume=False, on_step=lambda _, r: steps.append(r.step))
     assert steps[0] == 1
@@ -269,10 +263,10 @@ def test_without_resuming_a_run_starts_again(toy, whole, tmp_path):
 
 def test_a_shorter_run_than_its_checkpoint_has_nothing_to_do(toy, tmp_path):
     with pytest.raises(TrainingStopped):
-        toy.train(iterations=100, directory=tmp_path, stop_after=50)
-    options = {"identity": {"method": "toy", "iterations": 50}, "allow_changed_plan": True}
-    with pytest.raises(NothingToDo, match="ends at step 50, and 50 steps are done"):
-        toy.train(iterations=50, directory=tmp_path, **options)
+        toy.train(iterations=100, directory=tmp_path, stop_after=20)
+    options = {"identity": {"method": "toy", "iterations": 20}, "allow_changed_plan": True}
+    with pytest.raises(NothingToDo, match="ends at step 20, and 20 steps are done"):
+        toy.train(iterations=20, directory=tmp_path, **options)
 
 
 def test_a_stage_may_have_no_steps_and_is_finished_at_once(toy, tmp_path):
@@ -288,22 +282,25 @@ def test_a_stage_may_have_no_steps_and_is_finished_at_once(toy, tmp_path):
 
 
 def test_a_finished_run_can_be_made_longer(toy, tmp_path):
-    toy.train(iterations=40, directory=tmp_path, identity={"iterations": 40})
+    toy.train(iterations=20, directory=tmp_path, identity={"iterations": 20})
     steps = []
     longer = toy.train(
-        iterations=60, directory=tmp_path, identity={"iterations": 60}, allow_changed_plan=True,
+        iterations=30, directory=tmp_path, identity={"iterations": 30}, allow_changed_plan=True,
         on_step=lambda _, r: steps.append(r.step),
     )  # fmt: skip
-    assert steps == list(range(41, 61))
-    assert longer.figures.steps == 60
+    assert steps == list(range(21, 31))
+    assert longer.figures.steps == 30
 
 
 def test_another_configuration_is_refused_and_named(toy, tmp_path, caplog):
     with pytest.raises(TrainingStopped):
-        toy.train(iterations=60, directory=tmp_path, stop_after=50, identity={"lr": {"means": 0.1}})
+        toy.train(iterations=60, directory=tmp_path, stop_after=10, identity={"lr": {"means": 0.1}})
     with pytest.raises(CheckpointError, match=r"lr\.means: 0\.1 -> 0\.2.*--allow-changed-plan"):
         toy.train(iterations=60, directory=tmp_path, identity={"lr": {"means": 0.2}})
-    toy.train(iterations=60, directory=tmp_path, identity={"lr": {"means": 0.2}}, allow_changed_plan=True)
+    with pytest.raises(TrainingStopped):
+        toy.train(
+            iterations=60, directory=tmp_path, stop_after=12, identity={"lr": {"means": 0.2}}, allow_changed_plan=True
+        )
     assert "lr.means: 0.1 -> 0.2" in caplog.text
 
 
@@ -314,7 +311,7 @@ def test_another_plan_is_refused_and_shown(toy, tmp_path, caplog):
             scheduler.register_task(range(5, 50, 5), lambda: None, name="new idea")
 
     with pytest.raises(TrainingStopped):
-        toy.train(iterations=60, directory=tmp_path, stop_after=20)
+        toy.train(iterations=60, directory=tmp_path, stop_after=8)
     other = [Other(OptimizationParams(iterations=60))]
     with pytest.raises(CheckpointError, match=r"plan \+ pre \| new idea \| range\(5, 50, 5\)"):
         toy.train(other, directory=tmp_path)
@@ -324,7 +321,7 @@ def test_another_plan_is_refused_and_shown(toy, tmp_path, caplog):
 
 def test_another_scene_is_refused(toy, tmp_path):
     with pytest.raises(TrainingStopped):
-        toy.train(iterations=60, directory=tmp_path, stop_after=20)
+        toy.train(iterations=60, directory=tmp_path, stop_after=8)
     wider = toy.make_scene(radius=4.0)
     with pytest.raises(CheckpointError, match="scene extent"):
         toy.train(iterations=60, directory=tmp_path, scene=wider)
@@ -338,7 +335,7 @@ def test_state_that_does_not_fit_the_model_is_a_checkpoint_error(toy, tmp_path):
     from splatwizard_core.gaussians.model import GaussianModel
 
     with pytest.raises(TrainingStopped):
-        toy.train(iterations=60, directory=tmp_path, stop_after=20)
+        toy.train(iterations=60, directory=tmp_path, stop_after=8)
 
     class Renamed(GaussianModel):
         def __init__(self, *args, **kwargs):
@@ -348,7 +345,7 @@ def test_state_that_does_not_fit_the_model_is_a_checkpoint_error(toy, tmp_path):
         def load_state_dict_extra(self, extra):
             pass
 
-    with pytest.raises(CheckpointError, match="step 20, does not fit this run"):
+    with pytest.raises(CheckpointError, match="step 8, does not fit this run"):
         toy.train(iterations=60, directory=tmp_path, model=lambda: toy.make_model(toy.scene, Renamed))
 
 
