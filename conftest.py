@@ -1,29 +1,31 @@
 """How all tests of the workspace run: hypothesis without deadlines, no more threads than cores, long files first."""
 
+import contextlib
 import gc
-import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import cores  # before torch
 import forked_children
 import pytest
+import torch
 from forked_children import SELDOM
+from forked_workers import run_forked
 from hypothesis import HealthCheck, settings
 
 settings.register_profile("patient", max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("patient")
-
-# OpenMP's threads spin while they wait: two workers with a thread for every core each take many times as long.
-# Before torch is imported; processes that tests start inherit it.
-_workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-if _workers > 1:
-    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // _workers)))
 
 # Freed memory is kept for the next tensor: else each large one is mapped anew, page by page.
 forked_children.keep_freed_memory()
 
 # Collections of garbage are 40 % of the time in which ten thousand tests are collected; nothing of that is garbage.
 gc.disable()
+
+_threads = torch.get_num_threads()
+if cores.JOBS > 1:
+    torch.set_num_threads(1)  # until the workers are forked
 
 LONG_FIRST = (
     "tests/test_documented_commands.py",
@@ -45,7 +47,7 @@ LONG_FIRST = (
 @pytest.fixture(scope="session", autouse=True)
 def _fork_fresh_processes() -> Iterator[None]:
     """Fork what `sw run` decodes and evaluates in from one process that has imported torch."""
-    with forked_children.forking():
+    with contextlib.nullcontext() if forked_children.are_forked() else forked_children.forking():
         yield
 
 
@@ -62,6 +64,16 @@ def pytest_collection_finish() -> None:
     gc.freeze()
     gc.set_threshold(SELDOM)
     gc.enable()
+
+
+def pytest_runtestloop(session: pytest.Session) -> bool | None:
+    """With $TEST_JOBS, run the tests in so many forked processes."""
+    option = session.config.option
+    if cores.JOBS < 2 or sys.platform != "linux" or option.collectonly or session.testsfailed or not session.items:
+        return None
+    session.config.pluginmanager.getplugin("terminalreporter").showfspath = False  # files mix
+    run_forked(session, cores.JOBS, _threads)
+    return True
 
 
 @pytest.hookimpl(wrapper=True)

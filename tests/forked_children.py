@@ -40,9 +40,9 @@ MODULES = (
     "sw_doctor.child_check",
 )  # fmt: skip
 PLAIN = (
-    "SW_", "_SW_", "SPLATWIZARD_", "PYTHONPATH", "PYTEST_", "COV_", "TEST_", "TMPDIR", "HOME", "XDG_", "TORCH_HOME", "COLUMNS",
-    "PATH", "CXX", "TOY_", "OMP_NUM_THREADS", "PYTHONDONTWRITEBYTECODE", "TORCHINDUCTOR_", "CUBLAS_WORKSPACE_CONFIG",
-    "GLIBC_TUNABLES",
+    "SW_", "_SW_", "SPLATWIZARD_", "PYTHONPATH", "PYTEST_", "COV_", "TEST_", "TMPDIR", "HOME", "XDG_", "TORCH_HOME",
+    "COLUMNS", "PATH", "CXX", "TOY_", "OMP_NUM_THREADS", "PYTHONDONTWRITEBYTECODE", "TORCHINDUCTOR_", "GLIBC_TUNABLES",
+    "CUBLAS_WORKSPACE_CONFIG",
 )  # fmt: skip
 """Variables that mean the same to a process that reads them late; any other difference needs a new interpreter.
 
@@ -275,19 +275,29 @@ def _work(command: Any) -> dict[str, Any] | None:
 
 
 @contextlib.contextmanager
-def forking() -> Iterator[None]:
-    """Fork what `run_fresh` starts, where the system can; the block's end ends the server."""
+def forking(*, at_once: bool = False) -> Iterator[None]:
+    """Fork what `run_fresh` starts, where the system can; the block's end ends the server.
+
+    at_once     start the server before anything asks for it
+    """
     if sys.platform != "linux":
         yield
         return
     server, fresh = ForkServer(), splatwizard_core.runs.fresh
     before = fresh.subprocess
+    if at_once:
+        server._begin()
     fresh.subprocess = SimpleNamespace(**{**vars(subprocess), "run": server.run, "Popen": server.popen})  # type: ignore[assignment]
     try:
         yield
     finally:
         fresh.subprocess = before
         server.close()
+
+
+def are_forked() -> bool:
+    """Whether this process forks what `run_fresh` starts."""
+    return splatwizard_core.runs.fresh.subprocess is not subprocess
 
 
 @contextlib.contextmanager
