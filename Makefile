@@ -16,6 +16,8 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PACKAGES := splatwizard-native splatwizard-core $(sort $(wildcard plugins/*))
 PROJECTS := $(addsuffix /pyproject.toml,$(PACKAGES))
+# Every training on a CPU uses them; compiled while pip is busy.
+KERNELS := sw_rasterizers.native:MODULE,splatwizard_native.face_operations:POOL,splatwizard_native.fused.native:TRAINING
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 DEMO_OUT ?= out
 PYTEST_ARGS ?=
@@ -115,8 +117,8 @@ $(VENV)/bin/python:
 
 # hatchling first: with it at hand no package needs a build environment of its own.
 $(VENV)/.ready: $(VENV)/bin/python constraints.txt $(PROJECTS)
-	$(PIP) install -q -c constraints.txt hatchling editables
-	$(BIN)/python tools/install_packages.py --constraint constraints.txt $(PACKAGES)
+	$(PIP) install -q -c constraints.txt hatchling editables filelock
+	$(BIN)/python tools/install_packages.py --constraint constraints.txt --kernels $(KERNELS) $(PACKAGES)
 	@touch $@
 
 $(VENV)/.ready-dev: $(VENV)/.ready requirements-dev.txt

@@ -5,25 +5,40 @@
 pip starts Python three times for each of them; here one process makes the editable wheels, and pip unpacks them and
 brings what they depend on. Nothing is compiled ahead: Python writes the bytecode of a module when it is first imported.
 A run imports an eighth of what torch, sympy and scipy bring: 2 s of CPU instead of 36. Needs hatchling and editables.
+
+    --kernels sw_rasterizers.native:MODULE ...
+
+are compiled while pip brings what the packages depend on, which keeps one core busy; building them takes none of it but
+filelock. One that cannot be built is told by what uses it first.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib.metadata
 import json
 import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from hatchling.build import build_editable
+
+BUILD = """
+import pkgutil, sys
+
+for target in sys.argv[1:]:
+    pkgutil.resolve_name(target).build(say=lambda line: None)
+"""
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--constraint", required=True, type=Path)
+    parser.add_argument("--kernels", default="", help="MODULE:NAME of native modules, separated by commas")
     parser.add_argument("folders", nargs="+", type=Path)
     given = parser.parse_args()
     constraint, folders = str(given.constraint.resolve()), [folder.resolve() for folder in given.folders]
@@ -35,7 +50,17 @@ def main() -> None:
     names = [wheel.name.partition("-")[0] for wheel in wheels]
     for name, folder in zip(names, folders, strict=True):
         note_origin(name, folder)
-    subprocess.run([*pip, *names], check=True)
+    with building(list(filter(None, given.kernels.split(",")))):
+        subprocess.run([*pip, *names], check=True)
+
+
+@contextlib.contextmanager
+def building(kernels: Sequence[str]) -> Iterator[None]:
+    """Compile kernels during the block, on all cores but the one that it keeps busy; wait for them at its end."""
+    command = [sys.executable, "-c", BUILD, *kernels]
+    environment = {"MAX_JOBS": str(max(1, (os.cpu_count() or 1) - 1)), **os.environ}
+    with subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL):
+        yield
 
 
 def editable_wheel(folder: Path, made: str) -> str:
