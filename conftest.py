@@ -14,11 +14,14 @@ from forked_children import SELDOM
 from forked_workers import run_forked
 from hypothesis import HealthCheck, settings
 
+from splatwizard_core.plugins import remedies
+
 settings.register_profile("patient", max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("patient")
 
 # Freed memory is kept for the next tensor: else each large one is mapped anew, page by page.
 forked_children.keep_freed_memory()
+forked_children.leave_files_to_the_system()
 
 # Collections of garbage are 40 % of the time in which ten thousand tests are collected; nothing of that is garbage.
 gc.disable()
@@ -87,12 +90,10 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     return (yield)
 
 
+AS_INSTALLED, remedies._local = remedies._local, lambda found: found[0]
+
+
 @pytest.fixture
-def advice_as_installed() -> None:
+def advice_as_installed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let messages tell how to install from this checkout; elsewhere tests read them as they are written."""
-
-
-@pytest.fixture(autouse=True)
-def _advice_as_written(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    if "advice_as_installed" not in request.fixturenames:
-        monkeypatch.setattr("splatwizard_core.plugins.remedies._local", lambda found: found[0])
+    monkeypatch.setattr(remedies, "_local", AS_INSTALLED)

@@ -94,6 +94,11 @@ def keep_freed_memory() -> None:
             libc.mallopt(option, value)
 
 
+def leave_files_to_the_system() -> None:
+    """Write files without waiting for the disk: what a loss of power leaves is nothing that a test can see."""
+    os.fsync = lambda file: None
+
+
 class Forked:
     """Counterpart of `subprocess.Popen` for a forked child: its pid, pipes, signals and end.
 
@@ -446,6 +451,7 @@ if __name__ == "__main__":
     import weakref
 
     keep_freed_memory()
+    leave_files_to_the_system()
     for name in THEIRS:
         importlib.import_module(name)
     sys.meta_path.insert(0, Imported(OURS))

@@ -12,6 +12,7 @@ import itertools
 import os
 import pickle
 import queue
+import signal
 import sys
 import threading
 import traceback
@@ -37,20 +38,29 @@ def run_forked(session: pytest.Session, jobs: int, threads: int) -> None:
     os.write(numbers, b"".join(b"%*d" % (DIGITS, number) for number in range(len(files))))  # a pipe holds 10,000
     os.close(numbers)
     told: queue.Queue[tuple[int, str, Any]] = queue.Queue()
-    ends = []
+    ends, workers = [], []
     with contextlib.nullcontext() if forked_children.are_forked() else forked_children.forking(at_once=True):
         for worker in range(jobs):
             end, telling = os.pipe()
             sys.stdout.flush()
-            if os.fork() == 0:
+            if (pid := os.fork()) == 0:
                 torch.set_num_threads(threads)
                 _work(session, files, base / f"worker-{worker}", waiting, os.fdopen(telling, "wb"))
             os.close(telling)
+            workers.append(pid)
             ends.append(os.fdopen(end, "rb"))
         os.close(waiting)
         for worker, file in enumerate(ends):  # after all forks: a forked process has no threads
             threading.Thread(target=_listen, args=(file, worker, told), daemon=True).start()
-        _report(session, jobs, told)
+        try:
+            _report(session, jobs, told)
+        except BaseException:
+            for pid in workers:
+                os.kill(pid, signal.SIGTERM)
+            raise
+        finally:
+            for pid in workers:
+                os.waitpid(pid, 0)
 
 
 def _listen(file: BinaryIO, worker: int, told: queue.Queue[tuple[int, str, Any]]) -> None:

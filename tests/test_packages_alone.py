@@ -16,7 +16,7 @@ from splatwizard_core.coding.container import ContainerReader
 
 GOLDEN = Path(__file__).parent / "golden"
 ONE_OF_EACH_METHOD = sorted({ContainerReader.open(p).method: p for p in sorted(GOLDEN.glob("*.swz"))}.values())
-ALONE_IN_DEFAULT_TESTS = {"sw-hac-plus", "sw-report"}
+ALONE_IN_DEFAULT_TESTS = {"sw-hac-plus"}
 """The rest is slow: that a package declares what it imports is also read off its source (test_layers)."""
 IN_EVERY_ENVIRONMENT = needed("splatwizard-core")
 BY_NAME = {str(project(package)["name"]): package for package in PACKAGES}

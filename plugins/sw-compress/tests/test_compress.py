@@ -73,22 +73,21 @@ def test_a_larger_size_is_a_better_picture(source, small):
     assert large.record["quality"]["psnr"] > small.record["quality"]["psnr"]
 
 
-@pytest.mark.parametrize("quality", [38, 50])
-def test_a_quality_is_reached_and_little_exceeded(source, quality: float):
-    done = compress(source, quality=f"{quality}dB", views=6, device="cpu")
-    assert quality <= done.record["quality"]["psnr"] <= quality + 0.2
+def test_a_quality_is_reached_and_little_exceeded(source):
+    done = compress(source, quality="45dB", views=6, device="cpu")
+    assert 45 <= done.record["quality"]["psnr"] <= 45.2
 
 
-@pytest.mark.parametrize(("count", "size"), [(30, 2_000), (400, 2_000)])
-def test_the_size_of_a_tiny_scene_is_met_too(ball, count: int, size: int):
-    done = compress(ball(count), size=size, views=6, device="cpu")
-    assert 0.99 * size < done.record["bytes"] <= size
+def test_the_size_of_a_tiny_scene_is_met_too(ball):
+    done = compress(ball(30), size=2_000, views=6, device="cpu")
+    assert 0.99 * 2_000 < done.record["bytes"] <= 2_000
 
 
-def test_a_size_out_of_reach_names_one_that_is_not(ball):
+def test_a_size_out_of_reach_names_one_that_is_not(ball, tmp_path):
     model = ball(30)
     with pytest.raises(UserInputError) as error:
-        compress(model, size=900, views=6, device="cpu")
+        compress(model, size=900, views=6, device="cpu", out=tmp_path / "a.swz")
+    assert list(tmp_path.iterdir()) == []
     smallest = int(re.search(r"smallest has ([0-9,]+) bytes", str(error.value))[1].replace(",", ""))
     assert compress(model, size=smallest, views=6, device="cpu").record["bytes"] <= smallest
 
@@ -110,15 +109,7 @@ def test_more_than_the_finest_settings_give_is_told(source):
     assert any("finest settings" in line for line in lines)
 
 
-def test_a_size_out_of_reach_names_one_that_works(source, tmp_path):
-    with pytest.raises(UserInputError, match="smallest"):
-        compress(source, size=400, views=6, device="cpu", out=tmp_path / "a.swz")
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("stage", "stop"), [("sensitivities", KeyboardInterrupt()), ("encode", FULL_DISK), ("decode", KeyboardInterrupt())]
-)
+@pytest.mark.parametrize(("stage", "stop"), [("encode", FULL_DISK), ("decode", KeyboardInterrupt())])
 def test_an_interruption_and_a_full_disk_leave_nothing(ball, tmp_path, monkeypatch, stage: str, stop: BaseException):
     out, timed = tmp_path / "a.swz", Stages.timed
     out.write_bytes(b"an older file")
@@ -138,10 +129,9 @@ def test_an_interruption_and_a_full_disk_leave_nothing(ball, tmp_path, monkeypat
     assert out.read_bytes() == b"an older file"
 
 
-@pytest.mark.parametrize("name", ["spz", "sog"])
-def test_other_formats_meet_the_size(source, tmp_path, name: str):
-    out = tmp_path / f"a.{name}"
-    done = compress(source, size="14kB", views=6, device="cpu", format=name, out=out, drop_unseen=True)
+def test_another_format_meets_the_size(source, tmp_path):
+    out = tmp_path / "a.sog"
+    done = compress(source, size="14kB", views=6, device="cpu", format="sog", out=out, drop_unseen=True)
     assert out.stat().st_size <= 14_000
     assert done.record["bytes"] == out.stat().st_size
     assert read_gaussians(out, load_plugins()).num_rows == done.record["gaussians"]
@@ -242,6 +232,7 @@ def test_the_name_of_the_result_chooses_the_format_and_an_older_file_is_replaced
     options = ["--size", "14kB", "--views", "6", "--device", "cpu", "--out", str(out)]
     done = CliRunner().invoke(command, [str(source), *options])
     assert done.exit_code == 0, done.output
+    assert out.stat().st_size <= 14_000
     assert read_gaussians(out, load_plugins()).num_rows > 100
 
 
