@@ -45,15 +45,14 @@ def contents(config: ResolvedConfig) -> dict[str, object]:
 @pytest.mark.parametrize("name", METHODS)
 def test_a_written_configuration_is_read_back_to_the_same_values(tmp_path: Path, name: str):
     method = load_plugins().methods.load(name)
-    for preset in method.PRESETS:
-        for rate in method.RATES:
-            for sets in ({}, BESIDES):
-                first = resolve(method, preset, rate, sets=sets, scene="demo:tiny")
-                path = tmp_path / "config.toml"
-                path.write_text(first.toml())
-                again = resolve(method, config_file=path)
-                assert contents(again) == contents(first)
-                assert again.training_hash() == first.training_hash()
+    presets, rates, path = list(method.PRESETS), list(method.RATES), tmp_path / "config.toml"
+    chosen = [(preset, rates[-1], {}) for preset in presets] + [(presets[0], rate, BESIDES) for rate in rates]
+    for preset, rate, sets in chosen:
+        first = resolve(method, preset, rate, sets=sets, scene="demo:tiny")
+        path.write_text(first.toml())
+        again = resolve(method, config_file=path)
+        assert contents(again) == contents(first)
+        assert again.training_hash() == first.training_hash()
 
 
 @pytest.mark.pipeline

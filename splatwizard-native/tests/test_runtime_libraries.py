@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
 import sys
 
 import pytest
+from forked_children import run_python
 
 from splatwizard_native import toolchain
 
@@ -39,16 +39,25 @@ print(module.digits(), module.refused(3))
 """
 
 
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory):
+    """The source as an object, whose runtime is chosen when it is linked."""
+    folder = tmp_path_factory.mktemp("digits")
+    (folder / "digits.cpp").write_text(SOURCE, encoding="utf-8")
+    flags = (*toolchain.common_flags(), *toolchain.torch_include_flags())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CXX", "g++")
+        job = toolchain.Job(folder / "digits.cpp", folder / "digits.o", flags)
+        toolchain.Toolchain(1).compile([job], folder / "log")
+    return folder / "digits.o"
+
+
 @pytest.mark.parametrize("flags", ["", " -static-libgcc -static-libstdc++"], ids=["shared", "static"])
-def test_a_module_runs_on_the_runtime_of_torch(flags, tmp_path, monkeypatch):
+def test_a_module_runs_on_the_runtime_of_torch(flags, compiled, tmp_path, monkeypatch):
     monkeypatch.setenv("CXX", f"g++{flags}")
-    tools = toolchain.Toolchain(1)
-    source, made, log = tmp_path / "digits.cpp", tmp_path / "digits.so", tmp_path / "log"
-    source.write_text(SOURCE, encoding="utf-8")
-    include = toolchain.torch_include_flags()
-    tools.compile([toolchain.Job(source, tmp_path / "digits.o", (*toolchain.common_flags(), *include))], log)
-    tools.link([tmp_path / "digits.o"], made, log, toolchain.torch_libraries(cuda=False))
-    done = subprocess.run([sys.executable, "-c", CALL, str(made)], capture_output=True, text=True, check=False)
+    made = tmp_path / "digits.so"
+    toolchain.Toolchain(1).link([compiled], made, tmp_path / "log", toolchain.torch_libraries(cuda=False))
+    done = run_python("-c", CALL, str(made))
     assert (done.returncode, done.stdout.split()) == (0, ["4", "1"]), done.stderr
 
 

@@ -25,6 +25,7 @@ from sw_bench.gsc.views import Asked, camera_hash, size_of, views_of
 from sw_gaussians.ply import export_ply
 from sw_interchange.ply_cameras import PlyCamera, ply_camera_comments
 
+import splatwizard_core.runs.fresh
 from splatwizard_core.api import Camera, CapabilityError, GaussianModel, UserInputError
 from splatwizard_core.cli.main import main
 from splatwizard_core.plugins import load_plugins
@@ -227,7 +228,8 @@ def test_a_codec_whose_program_is_not_here_is_left_out_and_named(monkeypatch, ca
     assert "tmc13" in {entry.name for entry in protocol.codecs_of(protocol.Plan([], Path()), session)}
 
 
-def test_a_process_that_fails_tells_its_last_line(tmp_path: Path):
+def test_a_process_that_fails_tells_its_last_line(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(coding, "subprocess", splatwizard_core.runs.fresh.subprocess)
     with pytest.raises(CodecFailedError, match=r"sw info: .*nothing\.swz: there is no such file"):
         coding.run(["info", "nothing.swz"], tmp_path)
 

@@ -66,17 +66,17 @@ def fuzz(seeds: list[bytes], number: int, seed: int) -> Tally:
     return tally
 
 
-@pytest.mark.parametrize("decoder", ["compiled", "plain"])
-def test_a_few_hundred_hostile_files(seeds, monkeypatch, decoder):
+@pytest.mark.parametrize(("decoder", "files"), [("compiled", 120), ("plain", 45)])
+def test_hostile_files_are_refused_or_decode_to_something(seeds, monkeypatch, decoder, files):
     if decoder == "plain":
         for module in (streams, running_means):
             monkeypatch.setattr(module, "EXACT", SimpleNamespace(try_load=lambda: False))
     elif not (CODECS.try_load() and EXACT.try_load()):
         pytest.skip("there are no compiled kernels")
-    tally = fuzz(seeds, 120, 1)
+    tally = fuzz(seeds, files, 1)
     assert tally.problems == []
-    assert tally.outcomes["refused"] > 40
-    assert tally.outcomes["decoded"] > 5
+    assert tally.outcomes["refused"] > files / 3
+    assert tally.outcomes["decoded"] > files / 24
 
 
 @pytest.mark.parametrize("claim", [(0, 16, 1), (5, 4, 1), (0, 3, 2), (255, 255, 3)])

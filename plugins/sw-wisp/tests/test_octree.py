@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from splatwizard_core.api import BitstreamError
@@ -83,6 +83,7 @@ def test_subsets_together_are_the_set(name):
     assert all(map(same, again, subsets))
 
 
+@settings(max_examples=20)
 @given(st.lists(st.tuples(st.integers(3, 18), st.integers(0, 40)), max_size=60))
 def test_any_cells_return(pairs):
     cells = ordered([level for level, _ in pairs], [code * 8 ** (level - 3) // 7 for level, code in pairs])
