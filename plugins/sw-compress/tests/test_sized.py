@@ -86,6 +86,6 @@ def test_without_a_size_it_is_the_codec_that_it_writes_with(model):
 
 
 def test_a_size_out_of_reach_is_told(ball, tmp_path: Path):
-    with pytest.raises(UserInputError, match="no file of 200 bytes was found: the smallest has"):
+    with pytest.raises(UserInputError, match="size=200: header and sections of a file alone have"):
         encode(sized("3dgs", "200"), ball(30), {}, tmp_path / "a.swz")
     assert list(tmp_path.iterdir()) == []
