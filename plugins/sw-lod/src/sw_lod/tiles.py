@@ -311,7 +311,7 @@ def _joined(one: Lattice, other: Lattice) -> Lattice:
 
 
 def _shown(found: Lattice, settings: TileSettings) -> GaussianModel:
-    """What rows show while they are coarse."""
+    """Rows as they show while they are coarse."""
     layout = found.layout.model_copy(update={"num_gaussians": len(found.cells)})
     told = TiledLayout(**layout.model_dump(exclude={"packets", "precision", "sh_basis"}), first=0, base=[], groups=[],
                        times=settings.times, raw=settings.raw)  # fmt: skip
@@ -362,7 +362,7 @@ def decode(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
 def _read_lacking(
     number: int, part: Lattice, layout: TiledLayout, reader: ContainerReader, plugins: PluginManager
 ) -> NDArray[np.int32]:
-    """What the packet of this number has for these rows."""
+    """The part of these rows that the packet of this number has."""
     rows, width = part.symbols.shape
     with reader.decoding(f"{number}/{FINER}") as data:
         found = decode_matrix(entropy_model(reader, plugins), data, rows, 3 + width)
