@@ -23,6 +23,7 @@ from sw_codecs.models.band_context import suitable_classes
 from sw_codecs.models.settings import QuantizedSettings
 from sw_compress.rounding import Rounding, Steps, blocks, cells_of, entropy_bits, equal_classes, grid_of
 from sw_compress.rows import IMPORTANCE, select
+from sw_compress.stages import give_back
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Method, PluginManager
@@ -128,15 +129,15 @@ class Quantized:
     def sizes(self, model: GaussianModel, *, coarsest: bool = False) -> dict[str, NDArray[np.float64]]:
         """Bytes of each attribute at each of its levels, or the `coarsest`, from entropies; nothing is coded."""
         count = model.num_rows
-        part = model
+        part, some = model, slice(-1 if coarsest else None, None)
+        found = {POSITIONS: _position_sizes(model, POSITION_LEVELS[some])}
         if count > SAMPLE:
+            give_back()
             chosen = torch.randperm(count, generator=torch.Generator().manual_seed(0))[:SAMPLE].sort().values
             part = select(model, chosen.to(model.device))
         rounding = Rounding(part, self.power, OWN_BASIS)
         scale = count / max(part.num_rows, 1)
         sections = _Sections(rounding, suitable_classes(count), TABLE_BITS / scale)
-        some = slice(-1 if coarsest else None, None)
-        found = {POSITIONS: _position_sizes(model, POSITION_LEVELS[some])}
         for name in self.attributes(model):
             if name != POSITIONS:
                 steps = [Steps({name: STEPS[name] * 2.0**level}, POSITION_BITS) for level in self.levels(name)[some]]
@@ -166,6 +167,8 @@ def _position_sizes(model: GaussianModel, levels: NDArray[np.float64]) -> NDArra
     """Bytes of the positions at ascending levels."""
     finest, means = int(POSITION_BITS - levels[0]), model.means.detach()
     grid, parts = replace(grid_of(means), bits=finest), blocks(len(means), means.device)
+    if len(means) > SAMPLE:
+        give_back()  # the grid took doubles of all
     codes = torch.cat([interleave(cells_of(means[rows], grid).long()) for rows in parts])
     bits = octree_bits(codes.sort().values, finest)
     return np.array([bits[int(POSITION_BITS - level)] / 8 for level in levels])

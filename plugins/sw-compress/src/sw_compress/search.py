@@ -179,6 +179,7 @@ def _looked_at(search: Search, count: int, budget: float) -> tuple[Choice | None
     rounded = rounding.overwrite(steps) if in_place else rounding.model_at(steps)
     del rounding
     search.coder.forget()  # what it rounds by is not needed to draw
+    give_back()
     error = search.pictures.error(rounded)
     search.tried.append((part.num_rows, choice.bytes, decibels(error)))
     return choice, error, last
