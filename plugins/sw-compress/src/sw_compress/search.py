@@ -65,6 +65,7 @@ class Search:
         if count not in self._known:
             self.coder.forget()  # the part before, which is nearly as large as this one
             part = self.reduction.part(count)
+            give_back()  # what drawing it held on to
             found = part, self.errors.curves(self.coder, part)
             if self.model.num_rows > KEPT:
                 return found
