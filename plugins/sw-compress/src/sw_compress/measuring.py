@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from sw_gaussians import heap
 
 from splatwizard_core.api import GaussianModel, track
 from sw_compress.allocation import Curve
@@ -38,6 +39,7 @@ class Errors:
             rounding = coder.rounding(model)
             give_back()
             whole = rounding.model_at(coder.whole_steps(finest))
+            give_back()
             self.floor = pictures.error(whole)
             bar.advance()
             for name in names:
@@ -46,7 +48,9 @@ class Errors:
                     if level > coder.levels(name)[-1] or (level not in MEASURED and 2.0 ** logs[-1] > SMALL):
                         continue
                     steps = coder.whole_steps({**finest, name: level})
-                    error = pictures.error(rounding.change(whole, name, steps)) - self.floor
+                    rounding.change(whole, name, steps)
+                    heap.trim()
+                    error = pictures.error(whole) - self.floor
                     levels, logs = [*levels, level], [*logs, float(np.log2(max(error, 1e-14)))]
                     bar.advance(level in MEASURED)
                 self._measured[name] = levels, logs
