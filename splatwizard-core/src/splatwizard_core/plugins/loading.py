@@ -71,15 +71,22 @@ def installed_entry_points(group: str) -> list[importlib.metadata.EntryPoint]:
         return found
 
 
-def shadowed() -> list[str]:
-    """Return a line about each distribution of ours that lies on the path twice, or is superseded and still there."""
+@functools.cache
+def _places(path: tuple[str, ...]) -> dict[str, dict[tuple[str, str], None]]:
+    """Normalised name of a distribution -> its folders and versions, by names of folders, in the order of `path`."""
     places: dict[str, dict[tuple[str, str], None]] = {}
-    for folder in dict.fromkeys(sys.path):
+    for folder in dict.fromkeys(path):
         with contextlib.suppress(OSError):  # a zip file, a folder that is gone
             for name in sorted(os.listdir(folder or ".")):
                 if name.endswith((".dist-info", ".egg-info")):
                     distribution, _, version = name.rpartition(".")[0].partition("-")
                     places.setdefault(normal_name(distribution), {})[folder, version] = None
+    return places
+
+
+def shadowed() -> list[str]:
+    """Return a line about each distribution of ours that lies on the path twice, or is superseded and still there."""
+    places = _places(tuple(sys.path))
     told = []
     for name in sorted(our_distributions() & places.keys()):
         (first, used), *others = places[name]
@@ -168,5 +175,7 @@ def _requirement(text: str) -> tuple[Requirement, bool]:
 @functools.cache
 def _installed_version(distribution: str) -> str:
     """Version of a distribution, looked up once: plugins need the same few. Raises PackageNotFoundError."""
-    found = importlib.metadata.distribution(distribution)
-    return _header(found)["Version"] or found.version
+    if found := [v for _, v in _places(tuple(sys.path)).get(normal_name(distribution), ()) if v]:
+        return found[0]  # importlib.metadata would look through all folders for each
+    dist = importlib.metadata.distribution(distribution)
+    return _header(dist)["Version"] or dist.version
