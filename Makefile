@@ -22,8 +22,6 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 DEMO_OUT ?= out
 PYTEST_ARGS ?=
 TEST_JOBS ?= 2
-# Whole files, so that fixtures are made once, in the order of conftest.py: the long ones first.
-TEST_DIST := --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo test test-wheels test-geometry test-ray test-browser test-interchange test-wasm decoder-hashes docs-site coverage lint format bench kernels docs clean
 
@@ -37,7 +35,7 @@ demo: $(VENV)/.ready
 test coverage: export PYTHONDONTWRITEBYTECODE =
 
 test: $(VENV)/.ready-dev
-	$(BIN)/python -m pytest -n $(TEST_JOBS) $(TEST_DIST) $(PYTEST_ARGS)
+	TEST_JOBS=$(TEST_JOBS) $(BIN)/python -m pytest $(PYTEST_ARGS)
 
 test-geometry: $(VENV)/.ready-dev
 	$(PIP) install -q -c constraints.txt -e 'plugins/sw-geometry[mesh,unbounded]' --no-build-isolation
@@ -88,7 +86,7 @@ docs-site: $(VENV)/.ready-dev
 	$(BIN)/python -m mkdocs build
 
 coverage: $(VENV)/.ready-dev
-	$(BIN)/python -m pytest -n $(TEST_JOBS) $(TEST_DIST) --cov --cov-report=term --cov-fail-under=88 $(PYTEST_ARGS)
+	TEST_JOBS=$(TEST_JOBS) $(BIN)/python -m pytest --cov --cov-report=term --cov-fail-under=88 $(PYTEST_ARGS)
 
 lint: $(VENV)/.ready-dev
 	$(BIN)/ruff check .

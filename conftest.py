@@ -1,13 +1,17 @@
 """How all tests of the workspace run: hypothesis without deadlines, no more threads than cores, long files first."""
 
+import contextlib
 import gc
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-import cores  # noqa: F401 - before torch
+import cores  # before torch
 import forked_children
 import pytest
+import torch
 from forked_children import SELDOM
+from forked_workers import run_forked
 from hypothesis import HealthCheck, settings
 
 from splatwizard_core.plugins import remedies
@@ -21,6 +25,10 @@ forked_children.leave_files_to_the_system()
 
 # Collections of garbage are 40 % of the time in which ten thousand tests are collected; nothing of that is garbage.
 gc.disable()
+
+_threads = torch.get_num_threads()
+if cores.JOBS > 1:
+    torch.set_num_threads(1)  # until the workers are forked
 
 LONG_FIRST = (
     "tests/test_documented_commands.py",
@@ -42,7 +50,7 @@ LONG_FIRST = (
 @pytest.fixture(scope="session", autouse=True)
 def _fork_fresh_processes() -> Iterator[None]:
     """Fork what `sw run` decodes and evaluates in from one process that has imported torch."""
-    with forked_children.forking():
+    with contextlib.nullcontext() if forked_children.are_forked() else forked_children.forking():
         yield
 
 
@@ -59,6 +67,16 @@ def pytest_collection_finish() -> None:
     gc.freeze()
     gc.set_threshold(SELDOM)
     gc.enable()
+
+
+def pytest_runtestloop(session: pytest.Session) -> bool | None:
+    """With $TEST_JOBS, run the tests in so many forked processes."""
+    option = session.config.option
+    if cores.JOBS < 2 or sys.platform != "linux" or option.collectonly or session.testsfailed or not session.items:
+        return None
+    session.config.pluginmanager.getplugin("terminalreporter").showfspath = False  # files mix
+    run_forked(session, cores.JOBS, _threads)
+    return True
 
 
 @pytest.hookimpl(wrapper=True)

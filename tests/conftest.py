@@ -20,7 +20,7 @@ collect_ignore = ["golden/packages_0_2"]  # its tests run where it is installed 
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
     """A folder that the first worker of the session fills by `make`, while the others wait for it."""
     base = factory.getbasetemp()
-    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name
+    folder = (base.parent if "TEST_WORKER" in os.environ else base) / name
     with open(f"{folder}.lock", "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not (made := folder.with_suffix(".made")).exists():

@@ -280,19 +280,29 @@ def _work(command: Any) -> dict[str, Any] | None:
 
 
 @contextlib.contextmanager
-def forking() -> Iterator[None]:
-    """Fork what `run_fresh` starts, where the system can; the block's end ends the server."""
+def forking(*, at_once: bool = False) -> Iterator[None]:
+    """Fork what `run_fresh` starts, where the system can; the block's end ends the server.
+
+    at_once     start the server before anything asks for it
+    """
     if sys.platform != "linux":
         yield
         return
     server, fresh = ForkServer(), splatwizard_core.runs.fresh
     before = fresh.subprocess
+    if at_once:
+        server._begin()
     fresh.subprocess = SimpleNamespace(**{**vars(subprocess), "run": server.run, "Popen": server.popen})  # type: ignore[assignment]
     try:
         yield
     finally:
         fresh.subprocess = before
         server.close()
+
+
+def are_forked() -> bool:
+    """Whether this process forks what `run_fresh` starts."""
+    return splatwizard_core.runs.fresh.subprocess is not subprocess
 
 
 @contextlib.contextmanager

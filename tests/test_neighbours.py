@@ -42,7 +42,7 @@ sys.exit(pytest.main(sys.argv[1:], [Plugin()]))
 def run_pytest(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     """Run tests of this repository with the neighbours installed."""
     path = os.pathsep.join([*map(str, put_neighbours(folder)), *filter(None, sys.path)])
-    words = ["-q", "--assert=plain", "-p", "no:cacheprovider", "-p", "no:xdist", *arguments]
+    words = ["-q", "--assert=plain", "-p", "no:cacheprovider", *arguments]
     return run_python("-c", COLLECTING, *words, cwd=ROOT, env={**os.environ, "PYTHONPATH": path})
 
 
