@@ -4,7 +4,9 @@ import functools
 import io
 import json
 import multiprocessing
+import os
 import subprocess
+import sys
 import threading
 from types import SimpleNamespace
 
@@ -13,6 +15,7 @@ import torch
 from forked_children import start_python
 from sw_gaussians.stage import ThreeDGSStage
 from sw_gaussians.wrapped_stage import WrappedStage
+from sw_parallel import followers
 from sw_parallel.followers import Job, followed, wait_for
 from sw_parallel.ranks import Ranks
 
@@ -227,6 +230,21 @@ def test_a_process_that_does_not_come_up_is_told():
     ended = SimpleNamespace(exitcode=1)
     with pytest.raises(SplatwizardError, match="ended before the first step"):
         wait_for([ended], threading.Semaphore(0))
+
+
+def test_a_process_that_was_killed_is_told_and_one_that_failed_tells_itself():
+    sleep = "import time; time.sleep(60)"
+    for end, told in (("kill", "killed .SIGKILL"), ("exit", "lost another one")):
+        process = subprocess.Popen([sys.executable, "-S", "-c", sleep if end == "kill" else "exit(1)"])
+        if end == "kill":
+            process.kill()
+        exitcode = process.wait()
+        reader, writer = os.pipe()
+        os.close(writer)
+        other = SimpleNamespace(sentinel=reader, exitcode=exitcode)
+        with pytest.raises(SplatwizardError, match=told), followers._naming_killed([other]):
+            raise SplatwizardError("process 0 of 2 of this training has lost another one")
+        os.close(reader)
 
 
 @pytest.mark.cuda

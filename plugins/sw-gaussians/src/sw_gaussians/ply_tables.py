@@ -84,8 +84,11 @@ def read_header(head: bytes, size: int, name: str) -> PlyHeader:
     Raises BitstreamError.
     """
     match = re.search(rb"[\r\n]end_header(\r\n|\n|\r)", head)
-    if not head.removeprefix(BOM).startswith(b"ply") or match is None:
-        raise BitstreamError(f"{name}: not a .ply file: no header within {MAX_HEADER} bytes", section="header")
+    if not head.removeprefix(BOM).startswith(b"ply"):
+        raise BitstreamError(f"{name}: not a .ply file: it does not start with `ply`", section="header")
+    if match is None:
+        end = "truncated" if size <= MAX_HEADER else f"no header within {MAX_HEADER:,} bytes"
+        raise BitstreamError(f"{name}: not a whole .ply file: its header has no end ({end})", section="header")
     elements: list[_Element] = []
     named: set[str] = set()
     comments: list[str] = []

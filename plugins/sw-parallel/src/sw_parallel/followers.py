@@ -122,7 +122,7 @@ def followed(state: TrainingState, make_stage: MakeStage, count: int) -> Iterato
             wait_for(others, ready)
             with joined(Ranks(0, count), state.device, meeting) as ranks:
                 try:
-                    with _watched(others):
+                    with _watched(others), _naming_killed(others):
                         yield ranks
                 finally:
                     if not state.finished:
@@ -188,6 +188,22 @@ def _watched(others: Sequence[SpawnProcess]) -> Iterator[None]:
         yield
     finally:
         over.set()
+
+
+@contextlib.contextmanager
+def _naming_killed(others: Sequence[SpawnProcess]) -> Iterator[None]:
+    """Tell of a process that a signal ended, which had no words of its own."""
+    try:
+        yield
+    except SplatwizardError as error:
+        multiprocessing.connection.wait([process.sentinel for process in others], timeout=1)
+        for process in others:
+            if (process.exitcode or 0) < 0:
+                raise SplatwizardError(
+                    f"a process of this training was killed ({signal.Signals(-process.exitcode).name}; by the system, "
+                    "if memory ran out): the same command goes on from the last checkpoint"
+                ) from error
+        raise
 
 
 def with_pictures(scene: Scene) -> Scene:

@@ -150,11 +150,13 @@ def _print_file(facts: dict[str, Any]) -> None:
     total = ["file", f"{facts['size']:,}", "100.0%"]
     print_table(["section", "bytes", "share"], [*sections, [], total], right=2)
     if facts["cuts"]:
-        rows = [
-            [f"{cut['packets']}", f"{cut['bytes']:,}", "-" if cut["psnr"] is None else f"{cut['psnr']:.2f}"]
-            for cut in facts["cuts"]
-        ]
-        print_table(["packets", "bytes", "PSNR of the training views, dB"], rows, right=3)
+        rows = [[f"{cut['packets']}", f"{cut['bytes']:,}"] for cut in facts["cuts"]]
+        heads = ["packets", "bytes"]
+        if any(cut["psnr"] is not None for cut in facts["cuts"]):
+            heads.append("PSNR of the training views, dB")
+            for row, cut in zip(rows, facts["cuts"], strict=True):
+                row.append("-" if cut["psnr"] is None else f"{cut['psnr']:.2f}")
+        print_table(heads, rows, right=len(heads))
     if facts["packets"] < len(facts["cuts"]):
         click.echo(f"the file ends after packet {facts['packets']} of {len(facts['cuts'])}")
     for reason in facts["missing"].values():
