@@ -194,6 +194,7 @@ def test_a_source_is_never_replaced(small):
         ("a.txt", [], r"a.txt: of none of the formats that are read, .*\.ply, .*\.swz"),
         ("a.ply", [], "a.ply: not a .ply file"),
         ("empty.ply", [], "empty.ply: not a .ply file"),
+        ("cut.ply", [], r"cut.ply: not a whole .ply file: its header has no end .truncated"),
         ("folder", [], "folder is a folder, and this command takes a file"),
         ("ball.ply", ["--size", "0"], "'0' is no size: give bytes"),
         ("ball.ply", ["--size", "1e400MB"], "'1e400MB' is no size: .*8MB"),
@@ -214,7 +215,7 @@ def test_what_is_wrong_is_told_in_a_line_and_nothing_is_written(
     source, tmp_path, monkeypatch, capsys, name: str, options: list[str], told: str
 ):
     (tmp_path / "folder").mkdir()
-    for other, text in (("a.txt", "hi"), ("a.ply", "hi"), ("empty.ply", "")):
+    for other, text in (("a.txt", "hi"), ("a.ply", "hi"), ("cut.ply", "ply\nformat"), ("empty.ply", "")):
         (tmp_path / other).write_text(text)
     (tmp_path / "ball.ply").write_bytes(source.read_bytes())
     before = sorted(tmp_path.rglob("*"))

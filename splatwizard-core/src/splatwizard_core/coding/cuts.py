@@ -75,7 +75,7 @@ def chosen_cut(cuts: Sequence[Cut], length: int, header: int, prefix: Prefix, na
     there = sum(cut.bytes <= length for cut in cuts)
     ends = [header + cut.bytes for cut in cuts]
     if not (prefix.partial and there) and length not in [cut.bytes for cut in cuts]:
-        advice = f"packet {there} ({ends[there - 1]:,} bytes) is the last whole one: `sw decode --partial` takes it"
+        advice = f"--partial of `sw decode` or `sw truncate` takes packet {there} ({ends[there - 1]:,} bytes)"
         advice = advice if there else f"the first cut is at {ends[0]:,} bytes"
         raise ValueError(f"{header + length:,} bytes end at no declared cut: the file is truncated; {advice}")
     if prefix.partial and (lost := cuts[-1].bytes - length):
