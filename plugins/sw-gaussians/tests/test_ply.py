@@ -207,9 +207,9 @@ def good(tmp_path) -> bytes:
     [
         (lambda raw: raw[:-1], "truncated"),
         (lambda raw: raw[:-400], "truncated"),
-        (lambda raw: raw[:40], "no header"),
-        (lambda raw: b"", "no header"),
-        (lambda raw: b"\x89PNG" + raw, "no header"),
+        (lambda raw: raw[:40], "has no end"),
+        (lambda raw: b"", "does not start with"),
+        (lambda raw: b"\x89PNG" + raw, "does not start with"),
         (lambda raw: raw.replace(b"vertex 6", b"vertex 999999999999"), "claims"),
         (lambda raw: raw.replace(b"vertex 6", b"vertex -6"), "bad header line"),
         (lambda raw: raw.replace(b"float opacity", b"list uchar int opacity"), "no place"),
