@@ -22,7 +22,7 @@ from splatwizard_native.face import OPERATION, read_structs, structure
 
 STREAM = 4711
 RESULTS: dict[str, dict[str, int]] = {}
-"""What operations tell, where it is not 0."""
+"""Operation -> results that are not 0."""
 DECLARED = [resolve_module(target) for target in declared_modules(load_plugins())]
 MODULES = [m.cuda for m in DECLARED if m.cuda is not None and m.cuda.face]
 

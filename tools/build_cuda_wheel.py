@@ -42,7 +42,7 @@ Tag: py3-none-{platform}
 
 
 def offered(nvcc: str) -> list[str]:
-    """Those of ARCHITECTURES that a compiler knows, the last one with PTX."""
+    """Return the ARCHITECTURES that a compiler knows, the last one with PTX."""
     known = subprocess.run([nvcc, "--list-gpu-arch"], capture_output=True, text=True, check=True).stdout.split()
     found = [a for a in ARCHITECTURES if f"compute_{a.replace('.', '')}" in known]
     return [*found[:-1], f"{found[-1]}+PTX"]

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import enum
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import torch
 from torch import Tensor
 
-from splatwizard_core.api import Camera, GradBuffer
+from splatwizard_core.api import Camera, GaussianInputs, GradBuffer, RasterStats
 
 INPUTS = (
     "means", "opacities", "scales", "quats", "cov3d", "sh", "sh_dc", "sh_rest", "colors", "features", "scale_factors",
@@ -78,7 +80,44 @@ class Call:
             self.geom_indices, self.visible, self.background, grad2d, absgrad2d,
         )  # fmt: skip
 
+    def stats(self) -> RasterStats:
+        """Return what the forward pass told of itself."""
+        visible, pairs, evaluated, blended, invalid = self.counts
+        return RasterStats(
+            n_visible=visible,
+            n_pairs=pairs,
+            n_evaluated=evaluated if evaluated >= 0 else None,
+            n_blended=blended if blended >= 0 else None,
+            n_pixels=self.width * self.height,
+            n_invalid=invalid,
+            stage_seconds=self.seconds,
+        )
+
 
 def camera_numbers(cam: Camera) -> list[float]:
     """Return the camera as [18] numbers: R row by row, tau, fx, fy, cx, cy, near, far."""
     return [*cam.pose, cam.fx, cam.fy, cam.cx, cam.cy, cam.near, cam.far]
+
+
+def tensors_of(g: GaussianInputs, names: Sequence[str] = INPUTS) -> dict[str, Tensor | None]:
+    """Return some of the inputs by the names that the kernels have for them."""
+    sh = g.sh
+    found = {
+        "means": g.means,
+        "opacities": g.opacities,
+        "scales": g.scales,
+        "quats": g.quats,
+        "cov3d": g.cov3d,
+        "sh": None if sh is None else sh.dense,
+        "sh_dc": None if sh is None else sh.dc,
+        "sh_rest": None if sh is None else sh.rest,
+        "colors": g.colors,
+        "features": g.features,
+        "scale_factors": g.scale_factors,
+    }
+    return found if names is INPUTS else {name: found[name] for name in names}
+
+
+def as_bytes(mask: Tensor | None) -> Tensor | None:
+    """Return a mask as the kernels read it: uint8, 0 or 1."""
+    return None if mask is None else mask.to(torch.bool).contiguous().view(torch.uint8)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from splatwizard_core.api import AccumOutput, CapabilityError, GaussianInputs, RasterOptions, ScoreSpec
 from sw_rasterizers import cpu, cuda, cuda_face, face
-from sw_rasterizers.call import Call, Flag
+from sw_rasterizers.call import INPUTS, Call, Flag, tensors_of
 from sw_rasterizers.cpu import SAVE
 from sw_rasterizers.memory import empty
 
@@ -17,6 +17,8 @@ KINDS = (
 """Score kinds, in the order of `enum ScoreKind` in csrc/scores.h."""
 SENSITIVE = KINDS.index("grad_sq")
 """The kinds from here on depend on the light behind a splat; `is_sensitive` of csrc/scores.h."""
+SCORED = tuple(name for name in INPUTS if name not in ("features", "scale_factors"))
+"""Inputs that the kernels of scores take."""
 MAX_SCORES = 32
 """Largest number of scores per call; `kMaxScores` of csrc/scores.h."""
 FISHER = 21
@@ -60,13 +62,7 @@ def add_scores(g: GaussianInputs, call: Call, opt: RasterOptions, totals: Totals
     algorithms; then a Gaussian's sum over the tiles of a view is float32, too. No score is differentiable, and none
     touches a gradient.
     """
-    sh = g.sh
-    tensors = {
-        "means": g.means, "opacities": g.opacities, "scales": g.scales, "quats": g.quats, "cov3d": g.cov3d,
-        "sh": None if sh is None else sh.dense, "sh_dc": None if sh is None else sh.dc,
-        "sh_rest": None if sh is None else sh.rest, "colors": g.colors,
-    }  # fmt: skip
-    tensors = {name: None if x is None else x.detach().contiguous() for name, x in tensors.items()}
+    tensors = {name: None if x is None else x.detach().contiguous() for name, x in tensors_of(g, SCORED).items()}
     if not g.means.is_cuda:
         _add_on_cpu(tensors, call, opt.scores, totals)
         return

@@ -18,12 +18,11 @@ from splatwizard_core.api import (
     GradBuffer,
     RasterizerInfo,
     RasterOptions,
-    RasterStats,
     RenderResult,
     ShapeError,
 )
 from sw_rasterizers import plugin
-from sw_rasterizers.call import Call, Flag, camera_numbers
+from sw_rasterizers.call import Call, Flag, as_bytes, camera_numbers, tensors_of
 from sw_rasterizers.ops import rasterize, visible_radii
 from sw_rasterizers.scoring import Totals, add_scores, check_count
 from sw_rasterizers.unrecorded import Gradients, Unrecorded
@@ -59,7 +58,7 @@ class StandardRasterizer:
             return replace(result, scores=found.scores, fisher=found.fisher)
         call = self._call(g, cam, opt, learns=torch.is_grad_enabled())
         self._check(g, opt, call)
-        return _result(g, cam, opt, call, *rasterize(call, _tensors(g)))
+        return _result(g, opt, call, *rasterize(call, tensors_of(g)))
 
     def draw(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> tuple[RenderResult, Gradients]:
         """Draw one view as `render` does, unknown to autograd; see `Unrecorded.draw`. Raises as `render`."""
@@ -69,8 +68,8 @@ class StandardRasterizer:
             self._check(g, opt, call)
             return call
 
-        call, drawn, gradients = self._unrecorded.draw(g, cam, opt, _tensors(g), call_of)
-        return _result(g, cam, opt, call, *drawn[:4]), gradients
+        call, drawn, gradients = self._unrecorded.draw(g, cam, opt, tensors_of(g), call_of)
+        return _result(g, opt, call, *drawn[:4]), gradients
 
     def _check(self, g: GaussianInputs, opt: RasterOptions, call: Call) -> None:
         if g.colors is not None and g.colors.shape[1] == 0 and g.features is None and not opt.depth:
@@ -86,7 +85,7 @@ class StandardRasterizer:
             return radii
         self.info.check_geometry(g)
         return visible_radii(
-            g.means, g.scales, g.quats, g.cov3d, _as_bytes(g.visible), cam,
+            g.means, g.scales, g.quats, g.cov3d, as_bytes(g.visible), cam,
             scale_factors=g.scale_factors, geom_indices=g.geom_indices,
         )  # fmt: skip
 
@@ -121,34 +120,15 @@ class StandardRasterizer:
             opt.eps2d,
             flags,
             geom_indices=None if g.geom_indices is None else g.geom_indices.contiguous(),
-            visible=_as_bytes(g.visible),
+            visible=as_bytes(g.visible),
             background=None if background is None else background.detach().contiguous(),
             grad2d=GradBuffer() if learns and opt.grad2d else None,
             absgrad2d=GradBuffer() if learns and (opt.absgrad or opt.fragment_grad) else None,
         )
 
 
-def _tensors(g: GaussianInputs) -> dict[str, Tensor | None]:
-    """Return the inputs by the names that the kernels have for them."""
-    sh = g.sh
-    return {
-        "means": g.means,
-        "opacities": g.opacities,
-        "scales": g.scales,
-        "quats": g.quats,
-        "cov3d": g.cov3d,
-        "sh": None if sh is None else sh.dense,
-        "sh_dc": None if sh is None else sh.dc,
-        "sh_rest": None if sh is None else sh.rest,
-        "colors": g.colors,
-        "features": g.features,
-        "scale_factors": g.scale_factors,
-    }
-
-
 def _result(
     g: GaussianInputs,
-    cam: Camera,
     opt: RasterOptions,
     call: Call,
     image: Tensor,
@@ -171,7 +151,6 @@ def _result(
         depth["expected"] = depth["accumulated"] / alpha.clamp(min=1e-10)
     if median is not None and "median" in opt.depth:
         depth["median"] = median
-    visible, pairs, evaluated, blended, invalid = call.counts
     return RenderResult(
         image=image[:colors] if image.shape[0] > colors else image,
         radii=radii,
@@ -182,15 +161,7 @@ def _result(
         grad2d=call.grad2d,
         absgrad2d=call.absgrad2d if opt.absgrad else None,
         fragment_grad=call.absgrad2d if opt.fragment_grad else None,
-        stats=RasterStats(
-            n_visible=visible,
-            n_pairs=pairs,
-            n_evaluated=evaluated if evaluated >= 0 else None,
-            n_blended=blended if blended >= 0 else None,
-            n_pixels=cam.width * cam.height,
-            n_invalid=invalid,
-            stage_seconds=call.seconds,
-        ),
+        stats=call.stats(),
     )
 
 
@@ -246,7 +217,3 @@ def _flags(
         if asked:
             flags |= flag
     return flags
-
-
-def _as_bytes(mask: Tensor | None) -> Tensor | None:
-    return None if mask is None else mask.to(torch.bool).contiguous().view(torch.uint8)

@@ -17,12 +17,11 @@ from splatwizard_core.api import (
     GradBuffer,
     RasterizerInfo,
     RasterOptions,
-    RasterStats,
     RenderResult,
 )
 from sw_rasterizers import cpu, cuda, plugin
 from sw_rasterizers.call import INPUTS as INPUTS_OF_ALL
-from sw_rasterizers.call import Call, Flag, camera_numbers
+from sw_rasterizers.call import Call, Flag, as_bytes, camera_numbers, tensors_of
 from sw_rasterizers.unrecorded import Gradients, Unrecorded
 
 INPUTS = ("means", "opacities", "scales", "quats", "sh", "sh_dc", "sh_rest", "colors")
@@ -59,8 +58,8 @@ class SurfelRasterizer:
 
             warn_of_low_pass(opt.eps2d)
         call = self._call(g, cam, opt, learns=torch.is_grad_enabled())
-        image, radii, alpha, maps = _draw(call, _tensors(g))
-        return _result(g, cam, opt, call, image, radii, alpha, _told_apart(maps, opt))
+        image, radii, alpha, maps = _draw(call, tensors_of(g, INPUTS))
+        return _result(g, opt, call, image, radii, alpha, _told_apart(maps, opt))
 
     def draw(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> tuple[RenderResult, Gradients]:
         """Draw one view as `render` does, unknown to autograd; see `Unrecorded.draw`. Raises as `render`.
@@ -68,7 +67,7 @@ class SurfelRasterizer:
         Alpha and the maps of the result are leaves of autograd: gradients of theirs are taken into account.
         """
         make = functools.partial(self._call, g, cam, opt, learns=True)
-        call, drawn, gradients = self._unrecorded.draw(g, cam, opt, _tensors(g), make)
+        call, drawn, gradients = self._unrecorded.draw(g, cam, opt, tensors_of(g, INPUTS), make)
         image, radii, alpha, _, maps = drawn
         alpha = None if alpha is None else alpha.requires_grad_()
         leaves = {name: each.detach().requires_grad_() for name, each in _told_apart(maps, opt).items()}
@@ -82,14 +81,14 @@ class SurfelRasterizer:
             return gradients(by_image, None if alpha is None else alpha.grad, by_maps)
 
         with torch.enable_grad():
-            return _result(g, cam, opt, call, image, radii, alpha, leaves), with_maps
+            return _result(g, opt, call, image, radii, alpha, leaves), with_maps
 
     @torch.no_grad()
     def visible_filter(self, g: GaussianInputs, cam: Camera) -> Tensor:
         """Radii [N] int32 from means, scales and quats (opacities and colours are not looked at); 0 = culled."""
         self.info.check_geometry(g)
         geometry = [None if x is None else x.detach().contiguous() for x in (g.means, g.scales, g.quats)]
-        visible, camera = _as_bytes(g.visible), camera_numbers(cam)
+        visible, camera = as_bytes(g.visible), camera_numbers(cam)
         call = Call(camera, cam.width, cam.height, 0, 1.0, 0.0, Flag.SURFELS, visible=visible)
         on_device = cuda if g.means.is_cuda else cpu
         return on_device.visible_radii(call, dict(zip(("means", "scales", "quats"), geometry, strict=True)))
@@ -123,25 +122,10 @@ class SurfelRasterizer:
             opt.scale_modifier,
             0.0,
             flags,
-            visible=_as_bytes(g.visible),
+            visible=as_bytes(g.visible),
             background=None if background is None else background.detach().contiguous(),
             grad2d=GradBuffer() if learns and opt.grad2d else None,
         )
-
-
-def _tensors(g: GaussianInputs) -> dict[str, Tensor | None]:
-    """Return the inputs by the names that the kernels have for them."""
-    sh = g.sh
-    return {
-        "means": g.means,
-        "opacities": g.opacities,
-        "scales": g.scales,
-        "quats": g.quats,
-        "sh": None if sh is None else sh.dense,
-        "sh_dc": None if sh is None else sh.dc,
-        "sh_rest": None if sh is None else sh.rest,
-        "colors": g.colors,
-    }
 
 
 def _told_apart(maps: Tensor | None, opt: RasterOptions) -> dict[str, Tensor]:
@@ -153,7 +137,6 @@ def _told_apart(maps: Tensor | None, opt: RasterOptions) -> dict[str, Tensor]:
 
 def _result(
     g: GaussianInputs,
-    cam: Camera,
     opt: RasterOptions,
     call: Call,
     image: Tensor,
@@ -166,7 +149,6 @@ def _result(
     if "expected" in opt.depth:
         assert alpha is not None
         depth["expected"] = maps["accumulated"] / alpha.clamp(min=1e-10)
-    visible, pairs, evaluated, blended, invalid = call.counts
     return RenderResult(
         image=image,
         radii=radii,
@@ -176,20 +158,8 @@ def _result(
         normals=maps.get("normals"),
         distortion=maps.get("distortion"),
         grad2d=call.grad2d,
-        stats=RasterStats(
-            n_visible=visible,
-            n_pairs=pairs,
-            n_evaluated=evaluated if evaluated >= 0 else None,
-            n_blended=blended if blended >= 0 else None,
-            n_pixels=cam.width * cam.height,
-            n_invalid=invalid,
-            stage_seconds=call.seconds,
-        ),
+        stats=call.stats(),
     )
-
-
-def _as_bytes(mask: Tensor | None) -> Tensor | None:
-    return None if mask is None else mask.to(torch.bool).contiguous().view(torch.uint8)
 
 
 class _DrawSurfels(torch.autograd.Function):
