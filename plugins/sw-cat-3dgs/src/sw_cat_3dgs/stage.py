@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 WITHOUT_PICTURES = "spatial models", "nothing"
-"""Values of `CatModel.trained` in steps whose loss looks at no picture."""
+"""Values of `CatAnchors.trained` in steps whose loss looks at no picture."""
 
 
 class CatStage(CodedAnchorStage):
