@@ -48,7 +48,7 @@ def scene_of(extent=2.0):
         View(Camera.look_at(e, target, up, width=24, height=24, fov_x=1.0), f"{i}.png") for i, e in enumerate(eyes)
     ]
     scene = Scene("tiny", views, views[:1], None, Protocol("test", background="black"))
-    return SimpleNamespace(extent=extent, train=scene.train, views=views)
+    return SimpleNamespace(extent=extent, train=scene.train, views=views, points=None)
 
 
 def begin(stage, model, scene=None):
@@ -190,6 +190,19 @@ def test_the_opacity_network_may_wait_until_anchors_are_judged():
     assert early.learning_rates(1501) == after
     shortened = AnchorStage(AnchorParams(lr=lr, iterations=300, scale_schedule=True))  # a hundredth of 30,000 steps
     assert shortened.learning_rates(15)["mlp_opacity"] < shortened.learning_rates(16)["mlp_opacity"]
+
+
+@pytest.mark.parametrize(("count", "factor"), [(10_000, 0.3), (49_999, 0.3), (50_000, 1.0)])
+def test_it_waits_by_itself_where_points_are_few(count, factor):
+    stage, scene = AnchorStage(AnchorParams(lr={"mlp_opacity_early": None})), scene_of()
+    scene.points = PointCloud(torch.zeros(count, 3))
+    begin(stage, model_of(AnchorModel), scene)
+    assert stage.learning_rates(9)["mlp_opacity"] == pytest.approx(
+        factor * AnchorStage(AnchorParams()).learning_rates(9)["mlp_opacity"]
+    )
+    given = AnchorStage(AnchorParams(lr={"mlp_opacity_early": 0.5}))
+    begin(given, model_of(AnchorModel), scene)
+    assert given.early == 0.5
 
 
 def visible_offsets(seed, **config):

@@ -57,7 +57,7 @@ def test_values_by_data_set_are_the_authors(scene, voxel, factor, channel, masks
     assert found[0].scene.background == ("black" if scene.startswith("nerf") else None)
 
 
-@pytest.mark.parametrize(("scene", "factor"), [("nerf_synthetic/lego", 1.0), ("blender:a/folder", 0.1)])
+@pytest.mark.parametrize(("scene", "factor"), [("nerf_synthetic/lego", None), ("blender:a/folder", 0.1)])
 def test_the_opacity_network_keeps_its_rate_on_nerf_synthetic(scene, factor):
     found = resolved(scene)
     assert (found.config.lr.mlp_opacity_early, found.config.random_background_until) == (factor, 1_500)

@@ -62,6 +62,7 @@ class AnchorStage(Stage):
         opt.pictures.check(opt, pictures)
         self.pictures, self._whole = pictures, WholeAnchorStep()
         self.extent = 1.0  # known when the stage begins; a plan can be printed without a scene
+        self.early = opt.lr.mlp_opacity_early or 1.0
 
     def at(self, step: int) -> int:
         """Scale a step, or a step count, of the full schedule to this run, as `when` does."""
@@ -74,7 +75,9 @@ class AnchorStage(Stage):
         if not isinstance(model, self.trains):
             raise TypeError(f"stage '{self.name}' trains a {self.trains.__name__}, not a {type(model).__name__}")
         self.growth_draws = context.generator("growth")
-        self.extent = context.scene.extent
+        self.extent, points = context.scene.extent, context.scene.points
+        if self.opt.lr.mlp_opacity_early is None and points is not None and len(points.xyz) < 50_000:
+            self.early = 0.3  # at 1 none of chair's 10,000 was left
         if self.opt.visible_offsets:
             model.show_offsets(self.opt.visible_offsets, torch.stack([v.camera.center for v in context.scene.train]))
         return model
@@ -96,7 +99,7 @@ class AnchorStage(Stage):
         lr = self.opt.lr
         # An anchor whose opacities are all negative is never drawn again. All anchors of a random start have equal
         # features and most of them lie in empty space: at its full rate the network turns down all of them together.
-        early = lr.mlp_opacity_early if step <= self.at(lr.early_until) else 1.0
+        early = self.early if step <= self.at(lr.early_until) else 1.0
         return {
             "offsets": self.decay(step, lr.offsets_init, lr.offsets_final) * self.extent,
             "features": lr.features,
