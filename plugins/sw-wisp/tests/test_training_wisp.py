@@ -118,9 +118,16 @@ def test_rate_points_and_presets_resolve():
     assert [resolve(Wisp, "quick", rate).config.rate_term.lambda_ for rate in Wisp.RATES] == sorted(
         (r["rate_term.lambda_"] for r in Wisp.RATES.values()), reverse=True
     )
-    assert resolve(Wisp, "paper").pretrained["preset"] == "mcmc"
-    assert resolve(Wisp, "paper").pretrained["density.settings.cap"] == "none"
+    assert resolve(Wisp, "paper").pretrained == {"preset": "fast"}
     assert resolve(Wisp, "paper").config.budget.cap is None
+
+
+@pytest.mark.parametrize("scene", ["nerf_synthetic/lego", "blender:a/folder"])
+def test_rendered_scenes_start_from_mcmc(scene):
+    found = resolve(Wisp, "paper", scene=scene)
+    assert (found.pretrained["preset"], found.pretrained["density.settings.cap"]) == ("mcmc", "none")
+    assert (found.config.budget.density, found.config.budget.cap) == (1, None)
+    assert resolve(Wisp, "fast", scene=scene).pretrained == {"preset": "fast"}
 
 
 def test_there_is_no_start_from_points(plugins, toy):
@@ -148,7 +155,15 @@ def test_without_a_cap_as_many_begin_as_the_pixels_ask_for():
     assert cap_for(views_of(800, 800, 100)) == 250_000
     assert cap_for(views_of(1, 1)) == 31
     costs = torch.linspace(1, 2, 100, dtype=torch.float64)
-    assert len(kept_rows(Worth(costs, costs, 1.0), views_of(2, 2), WispConfig())) == round(1.5 * 0.8 * 62)
+    assert len(kept_rows(Worth(costs, costs, 1.0), views_of(3, 3), WispConfig())) == round(1.5 * 0.8 * 9)
+    assert len(kept_rows(Worth(costs, costs, 1.0), views_of(4, 4, 10), WispConfig())) == 100
+
+
+def test_photographs_begin_with_few_splats_per_pixel():
+    config = resolve(Wisp, "paper").config
+    costs = torch.linspace(1, 2, 900, dtype=torch.float64)
+    assert len(kept_rows(Worth(costs, costs, 1.0), views_of(200, 200), config)) == round(1.5 * 0.8 * 240)
+    assert config.budget.density * 27e6 == pytest.approx(cap_for(views_of(1000, 1000, 27)), rel=0.01)
 
 
 def test_conversion_keeps_the_pictures(train, toy, rasterizer):

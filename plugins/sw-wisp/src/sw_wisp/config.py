@@ -16,6 +16,9 @@ class Budget(Params):
     """Number of splats that the training begins with, 1.5 caps at most; removal decides how many stay."""
 
     cap: int | None = Field(None, ge=1, description="most splats, times `budget.cap_factor`; None: by training pixels")
+    density: float = Field(
+        1.0, gt=0, le=1, description="splats per training pixel at most, where `budget.cap` is None: more fit noise"
+    )
     cap_factor: float = Field(0.8, gt=0, le=10, description="what the rate points set")
     worthless: float = Field(0.2, ge=0, lt=1, description="largest share dropped first, of as many as do harm")
 

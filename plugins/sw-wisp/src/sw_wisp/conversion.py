@@ -36,7 +36,9 @@ looks the same."""
 def kept_rows(worth: Worth, views: Sequence[View], config: WispConfig) -> Tensor:
     """Return the rows [M] int64, ascending, that begin: the worthiest that the cap lets, less a number that do harm."""
     n = len(worth.change)
-    cap = round(HEAD_ROOM * (config.budget.cap or cap_for(views)) * config.budget.cap_factor)
+    pixels = sum(view.camera.width * view.camera.height for view in views)
+    most = config.budget.cap or min(cap_for(views), config.budget.density * pixels)
+    cap = round(HEAD_ROOM * most * config.budget.cap_factor)
     needless = min(int((worth.cost <= 0).sum()), int(config.budget.worthless * n))
     keep = max(1, min(n - needless, cap))
     return torch.sort(worth.change, descending=True, stable=True).indices[:keep].sort().values

@@ -12,7 +12,7 @@ from sw_wisp import file
 from sw_wisp.config import WispConfig
 from sw_wisp.model import WispModel
 from sw_wisp.plain import gaussians_of
-from sw_wisp.presets import PRESETS, RATES
+from sw_wisp.presets import BY_DATASET, PRESETS, RATES
 from sw_wisp.stage import WispStage
 
 if TYPE_CHECKING:
@@ -44,6 +44,7 @@ class Wisp(Method):
     version: ClassVar[int] = 1
     Config = WispConfig
     PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = PRESETS
+    BY_DATASET: ClassVar[Mapping[str, Mapping[str, Any]]] = BY_DATASET
     RATES: ClassVar[Mapping[str, Mapping[str, Any]]] = RATES
     DEFAULT_RATE: ClassVar[str] = "r3"
 
