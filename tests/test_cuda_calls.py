@@ -130,6 +130,52 @@ def test_gaussians(calls):
     assert (back.to_depth, back.to_normals) == (to_depth.data_ptr(), to_normals.data_ptr())
 
 
+class ChannelNetworks:
+    """Networks of channels that say zero."""
+
+    context = True
+
+    def __init__(self, features: int) -> None:
+        self.columns = torch.zeros(3, features, dtype=torch.int32)
+
+    def check_for(self, features, device):
+        assert self.columns.shape[1] == features
+
+    def packed(self, parameters):
+        return torch.cat([each.flatten() for each in parameters])
+
+    def unpacked(self, packed, factor):
+        return [packed * factor]
+
+    def forward(self, packed, inputs):
+        return inputs, inputs.new_zeros(len(inputs), 3 * self.columns.shape[1])
+
+    def backward(self, packed, inputs, hidden, slopes):
+        return torch.zeros_like(inputs), torch.zeros_like(packed)
+
+
+def test_hac(calls):
+    from sw_hac.fast.predicted_bits import MaskKind, Predicted, mixture_bits
+
+    features, k, count = 4, 2, 7
+    numbers = features + 6 + 3 * k
+    width = 2 * numbers + features
+    x, outputs, steps = rand(count, numbers, grad=True), rand(count, width, grad=True), rand(count, 3, grad=True)
+    masks, weights = rand(count, k, grad=True), rand(5, grad=True)
+    predicted = Predicted(rand(width), 0.5, 1e-6, 1e-9, 0.05, MaskKind.GATED)
+    given = (x, outputs, steps, masks, rand(count), predicted)
+    bits, _ = mixture_bits(*given, ChannelNetworks(features), (weights,))
+    torch.autograd.grad(bits, (x, outputs, steps, masks, weights), torch.ones(()))
+    (first,), (inputs,), (back,) = (calls[name] for name in ("mixture_bits", "channel_inputs", "channel_slopes"))
+    assert (first.count, first.numbers, first.width, first.features, first.k) == (count, numbers, width, features, k)
+    assert (first.kind, first.second is None, first.to_second is None) == (1, False, False)
+    assert (inputs.columns, back.columns) == (20, 20)
+    assert back.by_x == first.to_x
+    bits, _ = mixture_bits(*given)
+    torch.autograd.grad(bits, x, torch.ones(()))
+    assert (calls["mixture_bits"][1].second, calls["channel_slopes"][1].by_inputs) == (None, None)
+
+
 @pytest.fixture
 def drawn(calls, monkeypatch):
     """The calls, where every picture has room for its 7 splats and 20 pairs."""

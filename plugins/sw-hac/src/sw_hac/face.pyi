@@ -48,7 +48,7 @@ def channel_inputs(
 ) -> Structure: ...
 def channel_slopes(
     *,
-    slope: float,
+    slope: Tensor | Array[Any] | int,
     by_x: Tensor | Array[Any] | int,
     by_outputs: Tensor | Array[Any] | int,
     by_inputs: Tensor | Array[Any] | int | None = None,

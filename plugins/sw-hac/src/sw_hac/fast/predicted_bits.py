@@ -17,7 +17,7 @@ from sw_anchors.rate_model import SMALLEST_SCALE, AnchorForecast, Floors
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sw_hac import face
+from sw_hac import cuda_face, face
 from sw_hac.native import HAC
 
 
@@ -178,10 +178,14 @@ class _MixtureBits(torch.autograd.Function):
             inputs = _channel_inputs(x, outputs, *ctx.read)
             hidden, second = networks.forward(packed, inputs)
             kept = [packed, inputs, hidden]
-        form = torch.ops.sw_hac.mixture_bits if x.is_cuda else _bits_on_cpu
-        bits, *slopes = form(
-            x, outputs, p.units, second, columns, steps, masks, counted,
-            p.base, p.smallest, p.smallest_scale, p.scale_floor, int(p.masks),
+        learning = [x, outputs, steps, masks, *([] if second is None else [second])]
+        bits, *slopes = [torch.empty_like(t) for t in (steps, *learning)]  # derivatives of the sum of bits
+        to_x, to_outputs, to_steps, to_masks, *to_second = slopes
+        _operations(x).mixture_bits(
+            x=x, outputs=outputs, units=p.units, columns=columns, second=second, steps=steps, masks=masks,
+            counted=counted, base=p.base, smallest=p.smallest, smallest_scale=p.smallest_scale,
+            scale_floor=p.scale_floor, kind=int(p.masks), bits=bits, to_x=to_x, to_outputs=to_outputs,
+            to_steps=to_steps, to_masks=to_masks, to_second=next(iter(to_second), None),
         )  # fmt: skip
         ctx.networks = networks
         ctx.save_for_backward(*slopes, *kept)
@@ -202,29 +206,17 @@ class _MixtureBits(torch.autograd.Function):
         return to_x, to_outputs, to_steps, to_masks, None, None, None, *to_parameters
 
 
-def _bits_on_cpu(
-    x: Tensor, outputs: Tensor, units: Tensor, second: Tensor | None, columns: Tensor | None, steps: Tensor,
-    masks: Tensor, counted: Tensor, base: float, smallest: float, smallest_scale: float, scale_floor: float, kind: int,
-) -> list[Tensor]:  # fmt: skip
-    """Bits [S,3]; derivatives of their sum by x, outputs, steps, masks and, if there is one, second."""
-    learning = [x, outputs, steps, masks, *([] if second is None else [second])]
-    bits, *slopes = found = [torch.empty_like(t) for t in (steps, *learning)]
-    to_x, to_outputs, to_steps, to_masks, *to_second = slopes
-    face.mixture_bits(
-        x=x, outputs=outputs, units=units, columns=columns, second=second, steps=steps, masks=masks, counted=counted,
-        base=base, smallest=smallest, smallest_scale=smallest_scale, scale_floor=scale_floor, kind=kind, bits=bits,
-        to_x=to_x, to_outputs=to_outputs, to_steps=to_steps, to_masks=to_masks, to_second=next(iter(to_second), None),
-    )  # fmt: skip
-    return found
+def _operations(x: Tensor) -> Any:
+    """The operations of kernels/face.h where a tensor is."""
+    return cuda_face if x.is_cuda else face
 
 
 def _channel_inputs(x: Tensor, outputs: Tensor, units: Tensor, features: int, base: float, context: bool) -> Tensor:
     """Inputs of the networks of channels: features, perhaps context, then a column of ones and zeros."""
-    if x.is_cuda:
-        found: Tensor = torch.ops.sw_hac.channel_inputs(x, outputs, units, features, base, context)
-        return found
     inputs = x.new_empty(len(x), features * (4 if context else 1) // 4 * 4 + 4)
-    face.channel_inputs(x=x, outputs=outputs, units=units, features=features, base=base, context=context, inputs=inputs)
+    _operations(x).channel_inputs(
+        x=x, outputs=outputs, units=units, features=features, base=base, context=context, inputs=inputs
+    )
     return inputs
 
 
@@ -233,14 +225,9 @@ def _channel_slopes(
     base: float, context: bool,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Gradients by x and outputs, from the derivatives of the bits and the one of these by what follows."""
-    if by_x.is_cuda:
-        found: list[Tensor] = torch.ops.sw_hac.channel_slopes(
-            slope, by_x, by_outputs, by_inputs, units, features, base, context
-        )
-        return found[0], found[1]
     to_x, to_outputs = torch.empty_like(by_x), torch.empty_like(by_outputs)
-    face.channel_slopes(
-        slope=float(slope), by_x=by_x, by_outputs=by_outputs, by_inputs=by_inputs, units=units, features=features,
+    _operations(by_x).channel_slopes(
+        slope=slope, by_x=by_x, by_outputs=by_outputs, by_inputs=by_inputs, units=units, features=features,
         base=base, context=context, to_x=to_x, to_outputs=to_outputs,
     )  # fmt: skip
     return to_x, to_outputs

@@ -45,7 +45,7 @@ SW_OPERATION(sw_hac, channel_inputs);
 // Derivatives by x and outputs from those of the bits, among them what comes through the networks of channels.
 typedef struct {
   sw_head head;
-  double slope;                 // derivative by the bits
+  const float* slope;           // one number: the derivative by the bits
   const float* by_x;            // [count, numbers]
   const float* by_outputs;      // [count, width]
   const float* by_inputs;       // [count, columns] or null
