@@ -176,6 +176,76 @@ def test_hac(calls):
     assert (calls["mixture_bits"][1].second, calls["channel_slopes"][1].by_inputs) == (None, None)
 
 
+def test_anchors(calls, monkeypatch):
+    from sw_anchors.anchors import two_layers
+    from sw_anchors.fast import networks, rows, sample_bits, spawn
+
+    n, k, inputs = 5, 4, 8
+    monkeypatch.setattr(networks, "fits_kernel", lambda *_: True)
+    generator = torch.Generator().manual_seed(0)
+    three = tuple(two_layers(inputs + 4, 6, outputs * k, generator) for outputs in (1, 7, 3))
+    parameters = networks.parameters_of(three)
+    positions, features = rand(n, 3), rand(n, inputs + 9, grad=True)
+    outputs = networks.network_outputs(rand(3), positions, features[:, :inputs], three)
+    assert [each.shape for each in outputs] == [(n, k), (n, 7 * k), (n, 3 * k)]
+    slopes = [torch.ones_like(each) for each in outputs]
+    grads = torch.autograd.grad(outputs, [features, *parameters], slopes)
+    assert [grad.shape for grad in grads[1:]] == [parameter.shape for parameter in parameters]
+    (first,), (back,), (sizes,) = (
+        calls[name] for name in ("view_networks", "view_networks_backward", "view_networks_sizes")
+    )
+    assert (first.n, first.inputs, first.units, first.k, first.geometry_count) == (n, inputs, 6, k, 7 * k)
+    assert (first.feature_row, back.total % 4, sizes.n) == (inputs + 9, 0, n)
+    assert back.total >= sum(parameter.numel() for parameter in parameters)
+
+    alpha, geometry, color = (each.detach().requires_grad_() for each in outputs)
+    offsets, scales, masks = rand(n, k * 3, grad=True), rand(n, 6, grad=True), rand(n, k, grad=True)
+    drawn = torch.tensor([0, 3, 7])
+    given = (alpha, geometry, color, positions, offsets.view(n, k, 3), scales, masks)
+    found = spawn._Gaussians.apply(drawn, *given)
+    learning = alpha, geometry, color, offsets, scales, masks
+    grads = torch.autograd.grad(found, learning, [torch.ones_like(each) for each in found])
+    assert [grad.shape for grad in grads] == [each.shape for each in learning]
+    (back,) = calls["spawn_backward"]
+    assert (back.n, back.k, back.count, back.to_positions, back.ordered) == (n, k, 3, None, False)
+    assert calls["spawn"][0].offset_row == 3 * k
+
+    numbers = inputs + 6 + 3 * k
+    values, mean, scale, steps = (rand(n, columns, grad=True) for columns in (numbers, numbers, numbers, 3))
+    bits, _ = sample_bits.bits_of(values, mean, scale, steps, masks, rand(n), 1e-6, 1e-9)
+    torch.autograd.grad(bits, values, torch.ones(()))
+    assert calls["sample_bits"][0].numbers == numbers
+
+    index = torch.tensor([1, 4])
+    rows.load_rows(index, [positions, scales.detach()], [rand(3, 3), rand(2, 6)])
+    taken = rows.take_rows(index, positions, features[:, :inputs])
+    assert [each.shape for each in taken] == [(2, 3), (2, inputs)]
+    (put,) = torch.autograd.grad(taken[1], features, rand(2, inputs))
+    assert put.shape == features.shape
+    rows.add_rows(index, [rand(2, 6)], [scales.detach()])
+    assert [(call.way, call.tensors, call.count) for call in calls["copy_rows"]] == [
+        (0, 2, 2),
+        (0, 2, 2),
+        (1, 1, 2),
+        (2, 1, 2),
+    ]
+    with pytest.raises(RuntimeError, match="2 rows of"):
+        rows.add_rows(index, [rand(2, 5)], [scales.detach()])
+
+    of_rows = [rand(n, columns, grad=True) for columns in (inputs, 6, 3 * k, k)]
+    each_step = rand(n, 3, grad=True)
+    values, groups, masks, _ = rows.noisy_rows(
+        of_rows, rand(n, 1), torch.tensor(4.0), rand(n * numbers), each_step, 0.01
+    )
+    torch.autograd.grad(
+        (values, groups[0], masks), [*of_rows, each_step], [torch.ones_like(t) for t in (values, groups[0], masks)]
+    )
+    (back,), (there,) = calls["row_values_backward"], calls["row_values"]
+    assert (there.threshold, back.steps) == (0.01, each_step.data_ptr())
+    assert (back.count, back.width, back.k, back.step_rows) == (n, inputs, k, n)
+    assert (list(back.by_rows), back.by_scales) == ([numbers, inputs, 0, 0, k], None)
+
+
 @pytest.fixture
 def drawn(calls, monkeypatch):
     """The calls, where every picture has room for its 7 splats and 20 pairs."""

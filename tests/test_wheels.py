@@ -70,7 +70,7 @@ def test_zig_is_told_of_cpus_by_its_own_names_and_its_target_is_part_of_its_vers
 
 def test_the_distribution_of_cuda_kernels_pins_what_it_was_built_from(tmp_path):
     found = list(build_cuda_wheel.modules())
-    of_torch = {"sw_codecs_cuda", "sw_anchors_cuda"}
+    of_torch = {"sw_codecs_cuda"}
     with_kernels = {
         module.cuda.name for package in WITH_KERNELS for module in build_wheels.declared(package) if module.cuda
     }

@@ -61,6 +61,7 @@ def spawn_backward(
     to_scales: Tensor | Array[Any] | int,
     to_masks: Tensor | Array[Any] | int | None = None,
     to_positions: Tensor | Array[Any] | int | None = None,
+    ordered: bool,
 ) -> Structure: ...
 def heads_sizes(
     *,

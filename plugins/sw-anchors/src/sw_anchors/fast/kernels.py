@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Sequence
 
 import torch
@@ -29,6 +31,14 @@ def without_gaps(
         t if t is None or (inner is not None and t.stride()[1:] == inner) else t.contiguous()
         for t, inner in zip(tensors, strides, strict=True)
     )
+
+
+def zeros_together(shapes: Sequence[tuple[int, ...]], like: Tensor) -> list[Tensor]:
+    """Return float32 zeros of the shapes in one allocation, on the device of `like`: one by one each is a launch."""
+    counts = [math.prod(shape) for shape in shapes]
+    starts = list(itertools.accumulate(((count + 31) // 32 * 32 for count in counts), initial=0))  # 128 bytes
+    whole = like.new_zeros(starts[-1], dtype=torch.float32)
+    return [whole[at : at + count].view(shape) for at, count, shape in zip(starts, counts, shapes, strict=False)]
 
 
 def room_for_gaussians(count: int, like: Tensor) -> tuple[Tensor, ...]:

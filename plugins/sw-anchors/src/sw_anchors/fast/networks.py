@@ -6,6 +6,7 @@ the gradient is explicit (benchmarks/train_anchors.py).
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,6 +14,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from sw_anchors import cuda_face
 from sw_anchors.native import ANCHORS
 from sw_anchors.neural_gaussians import Networks
 
@@ -57,7 +59,10 @@ class _Outputs(torch.autograd.Function):
         ctx.by_kernel = not ctx.needs_input_grad[1] and fits_kernel(positions, features, parameters)
         if ctx.by_kernel:
             inputs = (center.contiguous(), positions.contiguous(), features)
-            alpha, geometry, color = torch.ops.sw_anchors.view_networks(*inputs, list(parameters))
+            found = tuple(features.new_empty(len(features), len(bias)) for bias in parameters[3::4])
+            alpha, geometry, color = found
+            named = _named(*inputs, parameters)
+            cuda_face.view_networks(**named, alpha=alpha, raw_geometry=geometry, raw_color=color)
             ctx.save_for_backward(*inputs, alpha, *parameters)
             return alpha, geometry, color
         first, last = parameters[0::4], parameters[2::4]
@@ -81,10 +86,18 @@ class _Outputs(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, to_alpha: Tensor, to_geometry: Tensor, to_color: Tensor) -> tuple[Tensor | None, ...]:
         if ctx.by_kernel:
-            inputs, alpha, parameters = ctx.saved_tensors[:3], ctx.saved_tensors[3], ctx.saved_tensors[4:]
-            slopes = [slope.contiguous() for slope in (to_alpha, to_geometry, to_color)]
-            found = torch.ops.sw_anchors.view_networks_backward(*inputs, list(parameters), alpha, slopes)
-            return None, None, *found
+            center, positions, features, alpha, *parameters = ctx.saved_tensors
+            sizes = cuda_face.view_networks_sizes(n=len(features), device=features.get_device())
+            to_features = features.new_empty(features.shape)
+            starts = list(itertools.accumulate(((p.numel() + 3) // 4 * 4 for p in parameters), initial=0))
+            whole = features.new_empty(starts[-1])
+            cuda_face.view_networks_backward(
+                **_named(center, positions, features, parameters), alpha=alpha, by_alpha=to_alpha.contiguous(),
+                by_geometry=to_geometry.contiguous(), by_color=to_color.contiguous(),
+                partial=features.new_empty(sizes.parts, sizes.part), to_features=to_features, to_parameters=whole,
+            )  # fmt: skip
+            places = zip(starts, parameters, strict=False)
+            return None, None, to_features, *(whole[at : at + p.numel()].view(p.shape) for at, p in places)
         direction, distance, context, weights, hidden, alpha, *last = ctx.saved_tensors
         outputs = (to_alpha * (1 - alpha * alpha), to_geometry, to_color)
         to_hidden = torch.empty_like(hidden)
@@ -105,6 +118,18 @@ class _Outputs(torch.autograd.Function):
             along = (to_direction * direction).sum(dim=1, keepdim=True)
             to_positions = (to_direction - direction * along) / distance + direction * to_context[:, -1:]
         return None, to_positions, to_context[:, :-4], *to_parameters
+
+
+def _named(center: Tensor, positions: Tensor, features: Tensor, parameters: Sequence[Tensor]) -> dict[str, Any]:
+    """Arguments of both operations: what the networks see, and their weights and biases."""
+    opacity, opacity_bias, geometry, geometry_bias, color, color_bias = (
+        p for i, p in enumerate(parameters) if i % 4 >= 2
+    )
+    return {
+        "center": center, "positions": positions, "features": features, "feature_row": features.stride(0),
+        "first": parameters[0::4], "first_bias": parameters[1::4], "opacity": opacity, "opacity_bias": opacity_bias,
+        "geometry": geometry, "geometry_bias": geometry_bias, "color": color, "color_bias": color_bias,
+    }  # fmt: skip
 
 
 def _aligned(part: Tensor) -> Tensor:

@@ -6,7 +6,9 @@ its index on the way back). Elsewhere the same by torch operations.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from enum import IntEnum
 from typing import Any
 
 import torch
@@ -14,12 +16,16 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from splatwizard_native import fast_enabled
+from sw_anchors import cuda_face
+from sw_anchors.fast.kernels import zeros_together
 from sw_anchors.native import ANCHORS
 from sw_anchors.shape import AnchorShape
 from sw_codecs.quantizers.straight_through import hard_mask
 
 MAX_TENSORS = 12
 """Largest number of tensors per launch: `kTensors` of kernels/rows.h."""
+GIVEN = ("features", "log_scales", "offsets", "logits", "weights", "valid", "noise", "steps")
+"""What both operations of noisy rows read, as kernels/cuda/face.h names it."""
 
 
 def fit_kernels(*tensors: Tensor) -> bool:
@@ -41,7 +47,7 @@ def take_rows(rows: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
 def load_rows(rows: Tensor, sources: Sequence[Tensor], into: Sequence[Tensor]) -> None:
     """Copy rows [V] (int64) of each source [N,...], flat, into the first V rows of its target [V or more, ...]."""
     if fit_kernels(*sources) and fit_kernels(*into):
-        torch.ops.sw_anchors.load_rows(rows, list(sources), list(into))
+        _copy(rows, sources, into, Way.GATHER)
         return
     for source, mine in zip(sources, into, strict=True):
         flat = source if source.dim() == mine.dim() else source.flatten(1)
@@ -52,7 +58,9 @@ def put_rows(rows: Tensor, sources: Sequence[Tensor | None], count: int) -> list
     """For each source [V or more,...] `count` rows of zeros, of which `rows` [V] are its first V; None for None."""
     given = [source for source in sources if source is not None]
     if fit_kernels(*given):
-        found = iter(torch.ops.sw_anchors.scatter_rows(rows, given, count))
+        room = zeros_together([(count, *source.shape[1:]) for source in given], rows)
+        _copy(rows, given, room, Way.SCATTER)
+        found = iter(room)
         return [None if source is None else next(found) for source in sources]
     return [
         None if s is None else s.new_zeros(count, *s.shape[1:]).index_copy_(0, rows, s[: len(rows)]) for s in sources
@@ -68,7 +76,7 @@ def add_rows(rows: Tensor, sources: Sequence[Tensor | None], into: Sequence[Tens
     pairs = [(s, t) for s, t in zip(sources, into, strict=True) if s is not None and t is not None]
     given, targets = [s for s, _ in pairs], [t for _, t in pairs]
     if fit_kernels(*given) and fit_kernels(*targets):
-        torch.ops.sw_anchors.add_rows(rows, given, targets)
+        _copy(rows, given, targets, Way.ADD)
         return
     for source, target in pairs:
         target.index_add_(0, rows, source)
@@ -77,9 +85,33 @@ def add_rows(rows: Tensor, sources: Sequence[Tensor | None], into: Sequence[Tens
 def gathered(rows: Tensor, tensors: Sequence[Tensor]) -> list[Tensor]:
     """Rows [S] (int64) of each tensor [N,...], which may be named more than once; without gradients."""
     if fit_kernels(*tensors):
-        found: list[Tensor] = torch.ops.sw_anchors.take_rows(rows, list(tensors))
+        found = [t.new_empty(len(rows), *t.shape[1:]) for t in tensors]
+        _copy(rows, tensors, found, Way.GATHER)
         return found
     return [t.index_select(0, rows) for t in tensors]
+
+
+class Way(IntEnum):
+    """Direction of `_copy`: `way` of kernels/cuda/face.h."""
+
+    GATHER = 0
+    SCATTER = 1
+    ADD = 2
+
+
+def _copy(rows: Tensor, sources: Sequence[Tensor], targets: Sequence[Tensor], way: Way) -> None:
+    """Copy or add rows of tensors that fit the kernels. RuntimeError for rows of other sizes, or too few of them."""
+    copies, count, gather = [], len(rows), way is Way.GATHER
+    for source, target in zip(sources, targets, strict=True):
+        words = math.prod(source.shape[1:])
+        if words != math.prod(target.shape[1:]) or len(target if gather else source) < count:
+            raise RuntimeError(f"{count} rows of {list(source.shape)} do not fit into {list(target.shape)}")
+        if not gather and (source.dtype, target.dtype) != (torch.float32, torch.float32):
+            raise RuntimeError(f"float32 rows are put and added, not {source.dtype} to {target.dtype}")
+        far = [words if t.is_contiguous() else t.stride(0) for t in (source, target)]
+        copies.append((source.data_ptr(), target.data_ptr(), words, *far))
+    listed: Any = cuda_face.row_copy * len(copies)
+    cuda_face.copy_rows(copies=listed(*copies), tensors=len(copies), rows=rows.contiguous(), way=int(way))
 
 
 class _TakeRows(torch.autograd.Function):
@@ -146,7 +178,12 @@ class _NoisyRows(torch.autograd.Function):
         threshold: float,
     ) -> tuple[Tensor, ...]:
         given = (features, log_scales, offsets, mask_logits, mask_weights, valid, noise, steps)
-        values, masks, kept = torch.ops.sw_anchors.row_values(*given, threshold)
+        count, k = mask_logits.shape
+        values = features.new_empty(count, features.shape[1] + 6 + 3 * k)
+        masks, kept = torch.empty_like(mask_logits), features.new_empty(count)
+        cuda_face.row_values(
+            **dict(zip(GIVEN, given, strict=True)), threshold=threshold, values=values, masks=masks, kept=kept
+        )
         ctx.save_for_backward(*given)
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(kept)
@@ -158,5 +195,15 @@ class _NoisyRows(torch.autograd.Function):
     def backward(ctx: Any, *slopes: Tensor | None) -> tuple[Tensor | None, ...]:
         learns = ctx.needs_input_grad[7]
         rows = [s if s is None or s.stride(1) == 1 else s.contiguous() for s in slopes[:5]]
-        found = torch.ops.sw_anchors.row_values_backward(*ctx.saved_tensors, rows, learns)
-        return *found[:4], None, None, None, found[4] if learns else None, None
+        by_values, by_features, by_scales, by_offsets, by_masks = rows
+        found = [torch.empty_like(t) for t in ctx.saved_tensors[:4]]
+        to_features, to_log_scales, to_offsets, to_logits = found
+        to_steps = to_features.new_empty(len(to_features), 3) if learns else None
+        cuda_face.row_values_backward(
+            **dict(zip(GIVEN, ctx.saved_tensors, strict=True)), threshold=0.0,
+            by_values=by_values, by_features=by_features, by_scales=by_scales, by_offsets=by_offsets,
+            by_masks=by_masks, by_rows=[0 if s is None else s.stride(0) for s in rows],
+            to_features=to_features, to_log_scales=to_log_scales, to_offsets=to_offsets, to_logits=to_logits,
+            to_steps=to_steps,
+        )  # fmt: skip
+        return *found, None, None, None, to_steps, None

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sw_anchors import face
+from sw_anchors import cuda_face, face
 from sw_anchors.fast.kernels import fit_kernels
 
 
@@ -48,18 +48,14 @@ class _Bits(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         learning = x, mean, scale, steps, masks = [t.contiguous() for t in (x, mean, scale, steps, masks)]
         counted = counted.contiguous()
-        if x.is_cuda:
-            bits, *slopes = torch.ops.sw_anchors.sample_bits(
-                x, mean, scale, steps, counted, masks, smallest, smallest_scale
-            )
-        else:
-            bits, *slopes = (torch.empty_like(t) for t in (steps, *learning))
-            to_x, to_mean, to_scale, to_steps, to_masks = slopes
-            face.sample_bits(
-                x=x, mean=mean, scale=scale, steps=steps, counted=counted, masks=masks, smallest=smallest,
-                smallest_scale=smallest_scale, bits=bits, to_x=to_x, to_mean=to_mean, to_scale=to_scale,
-                to_steps=to_steps, to_masks=to_masks,
-            )  # fmt: skip
+        bits, *slopes = (torch.empty_like(t) for t in (steps, *learning))
+        to_x, to_mean, to_scale, to_steps, to_masks = slopes
+        operations = cuda_face if x.is_cuda else face
+        operations.sample_bits(
+            x=x, mean=mean, scale=scale, steps=steps, counted=counted, masks=masks, smallest=smallest,
+            smallest_scale=smallest_scale, bits=bits, to_x=to_x, to_mean=to_mean, to_scale=to_scale,
+            to_steps=to_steps, to_masks=to_masks,
+        )  # fmt: skip
         ctx.save_for_backward(*slopes)
         return summed_bits(ctx, bits)
 

@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sw_anchors import face
+from sw_anchors import cuda_face, face
 from sw_anchors.fast import heads
-from sw_anchors.fast.kernels import fit_kernels, room_for_gaussians, without_gaps
+from sw_anchors.fast.kernels import fit_kernels, room_for_gaussians, without_gaps, zeros_together
 from sw_anchors.fast.networks import network_outputs
 from sw_anchors.neural_gaussians import Networks, NeuralGaussians
 
@@ -65,10 +65,11 @@ class _Gaussians(torch.autograd.Function):
         # Offsets and scales may be columns of a matrix: of these a row must be without gaps.
         given = without_gaps(inputs, (None, None, None, None, (3, 1), (1,), None))
         ctx.save_for_backward(*given, drawn)
-        if drawn.is_cuda:
-            return tuple(torch.ops.sw_anchors.spawn(*given, drawn))
         means, opacities, sizes, quats, colors = found = room_for_gaussians(len(drawn), drawn)
-        face.spawn(**_named(given, drawn), means=means, opacities=opacities, sizes=sizes, quats=quats, colors=colors)
+        operations = cuda_face if drawn.is_cuda else face
+        operations.spawn(
+            **_named(given, drawn), means=means, opacities=opacities, sizes=sizes, quats=quats, colors=colors
+        )
         return found
 
     @staticmethod
@@ -77,31 +78,27 @@ class _Gaussians(torch.autograd.Function):
         positions_learn, has_masks = ctx.needs_input_grad[4], ctx.saved_tensors[6] is not None
         *given, drawn = ctx.saved_tensors
         contiguous = [slope.contiguous() for slope in slopes]
-        if drawn.is_cuda:
-            *found, to_masks, to_positions = torch.ops.sw_anchors.spawn_backward(
-                *given, drawn, contiguous, positions_learn, torch.are_deterministic_algorithms_enabled()
-            )
-        else:
-            learning = [*given[:3], given[3] if positions_learn else None, *given[4:]]
-            zeros: list[Any] = [None if t is None else t.new_zeros(t.shape) for t in learning]
-            to_alpha, to_geometry, to_color, to_positions, to_offsets, to_scales, to_masks = zeros
-            means, opacities, sizes, quats, colors = contiguous
-            face.spawn_backward(
-                **_named(given, drawn),
-                by_means=means, by_opacities=opacities, by_sizes=sizes, by_quats=quats, by_colors=colors,
-                to_alpha=to_alpha, to_geometry=to_geometry, to_color=to_color, to_offsets=to_offsets,
-                to_scales=to_scales, to_masks=to_masks, to_positions=to_positions,
-            )  # fmt: skip
-            found = [to_alpha, to_geometry, to_color, to_offsets, to_scales]
-        to_alpha, to_geometry, to_color, to_offsets, to_scales = found
-        return (
-            None, to_alpha, to_geometry, to_color, to_positions if positions_learn else None, to_offsets, to_scales,
-            to_masks if has_masks else None,
+        alpha, geometry, color, positions, offsets, scales, masks = given
+        learning = alpha, geometry, color, offsets, scales, masks, positions if positions_learn else None
+        shapes = [t.shape for t in learning if t is not None]
+        zeros = zeros_together(shapes, drawn) if drawn.is_cuda else [alpha.new_zeros(shape) for shape in shapes]
+        to_alpha, to_geometry, to_color, to_offsets, to_scales, *rest = zeros
+        to_masks = rest.pop(0) if has_masks else None
+        to_positions = rest.pop(0) if positions_learn else None
+        means, opacities, sizes, quats, colors = contiguous
+        operations = cuda_face if drawn.is_cuda else face
+        operations.spawn_backward(
+            **_named(given, drawn),
+            by_means=means, by_opacities=opacities, by_sizes=sizes, by_quats=quats, by_colors=colors,
+            to_alpha=to_alpha, to_geometry=to_geometry, to_color=to_color, to_offsets=to_offsets,
+            to_scales=to_scales, to_masks=to_masks, to_positions=to_positions,
+            ordered=torch.are_deterministic_algorithms_enabled(),
         )  # fmt: skip
+        return None, to_alpha, to_geometry, to_color, to_positions, to_offsets, to_scales, to_masks
 
 
 def _named(given: Sequence[Tensor | None], drawn: Tensor) -> dict[str, Any]:
-    """Arguments of both operations of the CPU."""
+    """Arguments of both operations."""
     alpha, geometry, color, positions, offsets, scales, masks = given
     assert offsets is not None
     assert scales is not None

@@ -48,6 +48,7 @@ typedef struct {
   float* to_scales;             // [n, 6]
   float* to_masks;              // [n, k] or null
   float* to_positions;          // [n, 3] or null
+  bool ordered;                 // on a GPU: sums of an anchor have one order; on the CPU they always have
 } spawn_backward_call;
 SW_OPERATION(sw_anchors, spawn_backward);
 

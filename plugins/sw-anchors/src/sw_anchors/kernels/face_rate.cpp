@@ -1,6 +1,5 @@
 // Noisy values of anchors, their quantiser steps and bits.
-#include "face.h"
-
+#include "calls.h"
 #include "kernels.h"
 
 using namespace sw_anchors;
@@ -79,12 +78,6 @@ SW_OPERATION(sw_anchors, predicted_steps_backward) {
 
 SW_OPERATION(sw_anchors, sample_bits) {
   return splatwizard::guarded(call, [&](const splatwizard::Parallel& parallel) {
-    const int64_t features = call->numbers - 6 - 3 * call->k;
-    if (features < 0)
-      refuse("%lld numbers are too few for %lld offsets", (long long)call->numbers, (long long)call->k);
-    const Sample sample{call->count, int(features), int(call->k), call->x, call->mean, call->scale, call->steps,
-                        call->counted, call->masks, float(call->smallest), float(call->smallest_scale)};
-    SW_SELECT(sample_bits)(sample, {call->bits, call->to_x, call->to_mean, call->to_scale, call->to_steps,
-                                    call->to_masks}, parallel);
+    SW_SELECT(sample_bits)(sample_of(*call), bits_of(*call), parallel);
   });
 }

@@ -1,36 +1,13 @@
 // Gaussians that anchors spawn, from outputs of networks or together with the networks.
-#include "face.h"
-
 #include <algorithm>
 
+#include "calls.h"
 #include "kernels.h"
 
 using namespace sw_anchors;
 using splatwizard::refuse;
 
 namespace {
-
-// What all calls have; the rest is set by those who have it.
-template <class Call>
-Anchors anchors_of(const Call& call) {
-  if (call.n < 0 || call.k < 1) refuse("%lld anchors with %lld offsets", (long long)call.n, (long long)call.k);
-  Anchors from{};
-  from.n = call.n, from.k = call.k, from.positions = call.positions, from.masks = call.masks;
-  return from;
-}
-
-template <class Call>
-void set_rows(const Call& call, Anchors& from) {
-  from.offsets = call.offsets, from.offset_row = call.offset_row;
-  from.scales = call.scales, from.scale_row = call.scale_row;
-  from.alpha = call.alpha, from.drawn = call.drawn, from.count = call.count;
-}
-
-template <class Call>
-Gaussians slopes_of(const Call& call) {  // read only
-  return {const_cast<float*>(call.by_means), const_cast<float*>(call.by_opacities), const_cast<float*>(call.by_sizes),
-          const_cast<float*>(call.by_quats), const_cast<float*>(call.by_colors)};
-}
 
 void check_drawn(const Anchors& from) {
   const auto wrong = [&](int64_t i) {
@@ -66,21 +43,17 @@ Heads heads_of(const Call& call) {
 
 SW_OPERATION(sw_anchors, spawn) {
   return splatwizard::guarded(call, [&](const splatwizard::Parallel& parallel) {
-    Anchors from = anchors_of(*call);
-    set_rows(*call, from), check_drawn(from);
-    from.geometry = call->geometry, from.color = call->color;
-    SW_SELECT(spawn)(from, {call->means, call->opacities, call->sizes, call->quats, call->colors}, parallel);
+    const Anchors from = outputs_of(*call);
+    check_drawn(from);
+    SW_SELECT(spawn)(from, spawned_of(*call), parallel);
   });
 }
 
 SW_OPERATION(sw_anchors, spawn_backward) {
   return splatwizard::guarded(call, [&](const splatwizard::Parallel& parallel) {
-    Anchors from = anchors_of(*call);
-    set_rows(*call, from), check_drawn(from);
-    from.geometry = call->geometry, from.color = call->color;
-    const Gradients to{call->to_alpha,  call->to_geometry, call->to_color,    call->to_offsets,
-                       call->to_scales, call->to_masks,    call->to_positions};
-    SW_SELECT(spawn_backward)(from, slopes_of(*call), to, parallel);
+    const Anchors from = outputs_of(*call);
+    check_drawn(from);
+    SW_SELECT(spawn_backward)(from, slopes_of(*call), gradients_of(*call), parallel);
   });
 }
 
