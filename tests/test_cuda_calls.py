@@ -246,6 +246,59 @@ def test_anchors(calls, monkeypatch):
     assert (list(back.by_rows), back.by_scales) == ([numbers, inputs, 0, 0, k], None)
 
 
+LEVELS = [4.0, 8.0], [5, 9], [0, 216], [1, 0], 9
+"""A dense and a hashed level over three axes, of 216 and 512 entries."""
+
+
+def test_grids(calls):
+    from sw_codecs.fast import kernel_operations as codecs
+
+    x, values, gradient = rand(5, 3), rand(728, 2), rand(5, 4)
+    assert codecs.lookup(x, values, *LEVELS).shape == (5, 4)
+    assert codecs.backward(x, gradient, 728, 2, *LEVELS).shape == (728, 2)
+    codecs.backward(x, gradient, 728, 2, *LEVELS, largest=torch.ones(()))
+    (lookup,), (plain, ordered) = calls["grid_lookup"], calls["grid_backward"]
+    assert (lookup.count, lookup.axes, lookup.entries, lookup.features, lookup.levels) == (5, 3, 728, 2, 2)
+    assert (list(lookup.scales[:3]), list(lookup.dense[:3])) == ([4, 8, 0], [1, 0, 0])
+    assert (plain.largest, plain.sums, ordered.sums is None, ordered.largest is None) == (None, None, False, False)
+    codecs.signs_lookup(x, (0, 1, 2), values, rand(5, 7), 3, *LEVELS)
+    codecs.signs_backward(x, (0, 2), values, rand(5, 7), 3, [4.0], [5], [0], [1], 9, largest=torch.ones(()))
+    (lookup,), (back,) = calls["signs_lookup"], calls["signs_backward"]
+    assert (lookup.row, lookup.first, lookup.dimensions, back.dimensions, list(back.axes)) == (7, 3, 3, 2, [0, 2, 0])
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_planes(calls, monkeypatch, deterministic):
+    from sw_cat_3dgs.fast import plane_kernels
+
+    monkeypatch.setattr(torch, "are_deterministic_algorithms_enabled", lambda: deterministic)
+    planes = [rand(3, 4, 8, 9), rand(3, 4, 16, 18)]
+    assert plane_kernels.fit_kernels(planes)
+    sums, to_planes = plane_kernels.plane_bits(planes, rand(3, 1058), planes_learn=True)
+    assert (sums.shape, [each.shape for each in to_planes]) == ((3, 1060), [plane.shape for plane in planes])
+    (call,), (sizes,) = calls["plane_bits"], calls["plane_bits_sizes"]
+    assert (sizes.scales, sizes.channels) == (2, 4)
+    assert (call.scales, call.orientations, call.channels, call.parts) == (2, 3, 4, 0)
+    assert (list(call.heights), list(call.widths)) == ([8, 16, 0, 0], [9, 18, 0, 0])
+    assert list(call.ordered_counts) == ([3 * 192 * 9, 3 * 192 * 36, 0, 0] if deterministic else [0] * 4)
+    assert plane_kernels.plane_bits(planes, rand(3, 1058), planes_learn=False)[1] == []
+    assert list(calls["plane_bits"][1].to_planes) == [None] * 4
+
+    cells, weights = torch.zeros(7, 2, 3, 4, dtype=torch.int32), rand(7, 2, 3, 4)
+    features = plane_kernels.sampled(cells, weights, planes, 16.0)
+    assert features.shape == (7, 2 * 3 * 4)
+    found = plane_kernels.sampled_backward(cells, weights, features, planes)
+    assert [each.shape for each in found] == [plane.shape for plane in planes]
+    (call,), (back,) = calls["triplane_lookup"], calls["triplane_backward"]
+    assert (call.count, call.scales, call.channels, call.width, call.gain) == (7, 2, 4, 24, 16)
+    assert list(call.places) == list(back.places) == [72, 288, 0, 0]
+    assert (back.largest is None, back.tables[0] is None, back.sums[0] is None) == (
+        not deterministic, deterministic, not deterministic
+    )  # fmt: skip
+    with pytest.raises(RuntimeError, match=r"planes must be \[3,4,H,W\]"):
+        plane_kernels.sampled(cells, weights, [planes[0], rand(3, 5, 2, 2)], 0.0)
+
+
 @pytest.fixture
 def drawn(calls, monkeypatch):
     """The calls, where every picture has room for its 7 splats and 20 pairs."""

@@ -45,6 +45,8 @@ def grid_backward(
     log2_size: int,
     table: Tensor | Array[Any] | int,
     width: int | None = None,
+    largest: Tensor | Array[Any] | int | None = None,
+    sums: Tensor | Array[Any] | int | None = None,
 ) -> Structure: ...
 def signs_lookup(
     *,
@@ -85,6 +87,8 @@ def signs_backward(
     gradient: Tensor | Array[Any] | int,
     row: int | None = None,
     first: int,
+    largest: Tensor | Array[Any] | int | None = None,
+    sums: Tensor | Array[Any] | int | None = None,
 ) -> Structure: ...
 def sites_lookup(
     *,

@@ -1,4 +1,4 @@
-"""Operations of grids, planes, Huffman codes and codebooks: those of the CPU with room for what they write, or CUDA's.
+"""Operations of grids, planes, Huffman codes and codebooks, on the CPU and on CUDA, with room for what they write.
 
 Callers ask first whether there are kernels (native.py), and have their plain version. RuntimeError for arguments that
 do not fit. The levels of a grid are lists of scales, last vertices, first entries, whether dense; then log2_size.
@@ -13,18 +13,15 @@ import torch
 from torch import Tensor
 from torch.autograd.graph import increment_version
 
-from sw_codecs.fast import face
+from sw_codecs.fast import cuda_face, face
 
 Levels = tuple[list[float], list[int], list[int], list[int], int]
 
 
 def lookup(x: Tensor, values: Tensor, *levels: Any) -> Tensor:
     """Return features [n, levels * features] of places x [n,d] in a grid of values [entries, features]."""
-    if x.is_cuda:
-        found: Tensor = torch.ops.sw_codecs.lookup(x, values, *levels)
-        return found
     found = x.new_empty(len(x), len(levels[0]) * values.shape[1])
-    face.grid_lookup(x=x, values=values, found=found, **_named(levels))
+    _operations(x).grid_lookup(x=x, values=values, found=found, **_named(levels))
     return found
 
 
@@ -35,11 +32,8 @@ def backward(
 
     largest     on CUDA: no number of the gradient exceeds it; with it sums are the same in any order
     """
-    if x.is_cuda:
-        table: Tensor = torch.ops.sw_codecs.backward(x, gradient, entries, features, *levels, largest)
-        return table
     table = x.new_zeros(entries, features)
-    face.grid_backward(x=x, gradient=gradient, table=table, **_named(levels))
+    _operations(x).grid_backward(x=x, gradient=gradient, table=table, **_named(levels), **_sums(largest, table))
     return table
 
 
@@ -48,10 +42,7 @@ def signs_lookup(x: Tensor, axes: Sequence[int], table: Tensor, found: Tensor, f
 
     axes    columns of x [n,d]
     """
-    if x.is_cuda:
-        torch.ops.sw_codecs.signs_lookup(x, axes, table, found, first, *levels)
-        return
-    face.signs_lookup(
+    _operations(x).signs_lookup(
         x=x, axes=axes, dimensions=len(axes), table=table, found=found, first=first, **_named(levels)
     )  # fmt: skip
     increment_version(found)
@@ -62,11 +53,9 @@ def signs_backward(
     largest: Tensor | None = None,
 ) -> None:  # fmt: skip
     """Add to `table` the gradients by its signs; arguments as of `signs_lookup` and `backward`."""
-    if x.is_cuda:
-        torch.ops.sw_codecs.signs_backward(x, axes, table, gradient, first, *levels, largest)
-        return
-    face.signs_backward(
-        x=x, axes=axes, dimensions=len(axes), table=table, gradient=gradient, first=first, **_named(levels)
+    _operations(x).signs_backward(
+        x=x, axes=axes, dimensions=len(axes), table=table, gradient=gradient, first=first, **_named(levels),
+        **_sums(largest, table),
     )  # fmt: skip
     increment_version(table)
 
@@ -117,6 +106,16 @@ def nearest_entries(rows: Tensor, entries: Tensor) -> tuple[Tensor, float]:
     """
     index = rows.new_empty(len(rows), dtype=torch.int64)
     return index, face.nearest_entries(rows=rows, entries=entries, index=index).share
+
+
+def _operations(x: Tensor) -> Any:
+    """The operations where a tensor is."""
+    return cuda_face if x.is_cuda else face
+
+
+def _sums(largest: Tensor | None, table: Tensor) -> dict[str, Tensor]:
+    """Arguments that give sums one order on CUDA, if the largest number is known."""
+    return {} if largest is None else {"largest": largest, "sums": torch.zeros_like(table, dtype=torch.int64)}
 
 
 def _named(levels: Sequence[Any]) -> dict[str, Any]:

@@ -1,42 +1,9 @@
-#include "face.h"
-
+#include "calls.h"
 #include "kernels.h"
-#include "levels.h"
 
 namespace {
 
 using namespace splatwizard;
-
-template <class Call>
-sw_grid::Levels levels_of(const Call* call, int64_t axes) {
-  return sw_grid::levels_of(call->levels, call->scales, call->lasts, call->starts, call->dense, call->log2_size, axes,
-                            call->entries, [](const std::string& text) { refuse("%s", text.c_str()); });
-}
-
-template <class Call>
-sw_grid::Levels features_of(const Call* call) {
-  const sw_grid::Levels levels = levels_of(call, call->axes);
-  if (call->features < 1 || call->features > 1 << 20 || call->width != call->levels * call->features)
-    refuse("features do not fit");
-  return levels;
-}
-
-// Places in a grid of signs; its features start at column `first`.
-template <class Call>
-sw_grid::Signs signs_of(const Call* call) {
-  if (call->features < 1 || call->features > sw_grid::kMaxFeatures || call->columns > 3)
-    refuse("x must be [n,2 or 3], the table [entries,1 to %d]", sw_grid::kMaxFeatures);
-  sw_grid::Signs at{};
-  at.levels = levels_of(call, call->dimensions);
-  at.count = call->count, at.columns = int(call->columns), at.axes = int(call->dimensions);
-  for (int64_t i = 0; i < call->dimensions; ++i) {
-    if (call->axes[i] < 0 || call->axes[i] >= call->columns) refuse("there is no axis %lld", (long long)call->axes[i]);
-    at.axis[i] = int(call->axes[i]);
-  }
-  at.features = int(call->features), at.row = call->row, at.x = call->x;
-  if (call->first < 0 || call->first > call->row - call->levels * call->features) refuse("features do not fit");
-  return at;
-}
 
 template <class Call>
 sw_sites::Sites sites_of(const Call* call) {
@@ -54,28 +21,28 @@ sw_sites::Sites sites_of(const Call* call) {
 
 SW_OPERATION(sw_codecs, grid_lookup) {
   return guarded(call, [&](const Parallel& parallel) {
-    SW_SELECT(grid_lookup)(features_of(call), int(call->axes), int(call->features), call->count, call->x, call->values,
+    SW_SELECT(grid_lookup)(sw_grid::features_of(call, 1 << 20), int(call->axes), int(call->features), call->count, call->x, call->values,
                            call->found, parallel);
   });
 }
 
 SW_OPERATION(sw_codecs, grid_backward) {
   return guarded(call, [&](const Parallel& parallel) {
-    SW_SELECT(grid_backward)(features_of(call), int(call->axes), int(call->features), call->count, call->x,
+    SW_SELECT(grid_backward)(sw_grid::features_of(call, 1 << 20), int(call->axes), int(call->features), call->count, call->x,
                              call->gradient, call->table, parallel);
   });
 }
 
 SW_OPERATION(sw_codecs, signs_lookup) {
   return guarded(call, [&](const Parallel& parallel) {
-    const sw_grid::Signs at = signs_of(call);
+    const sw_grid::Signs at = sw_grid::signs_of(call);
     if (at.count > 0) SW_SELECT(signs_lookup)(at, call->table, call->found + call->first, parallel);
   });
 }
 
 SW_OPERATION(sw_codecs, signs_backward) {
   return guarded(call, [&](const Parallel& parallel) {
-    const sw_grid::Signs at = signs_of(call);
+    const sw_grid::Signs at = sw_grid::signs_of(call);
     if (at.count > 0) SW_SELECT(signs_backward)(at, call->gradient + call->first, call->table, parallel);
   });
 }

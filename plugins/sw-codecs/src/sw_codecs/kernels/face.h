@@ -1,5 +1,5 @@
-// The operations of grids, planes, Huffman codes and codebooks on the CPU: what C and Python call. See
-// <splatwizard/c_face.h> for the form, kernels.h for what they compute.
+// The operations of grids, planes, Huffman codes and codebooks: what C and Python call. See <splatwizard/c_face.h> for
+// the form, kernels.h for what they compute.
 //
 // A grid has `levels` levels over its axes: of each `scales`, last vertices, first entries of its table and whether it is
 // dense. `log2_size`: of a hashed table.
@@ -37,6 +37,8 @@ typedef struct {
   int64_t log2_size;
   float* table;             // [entries, features]
   int64_t width;            // levels * features
+  const float* largest;     // or null: on a GPU one number that none of `gradient` exceeds, for sums the same in any order
+  int64_t* sums;            // [entries, features] or null: with it zeros
 } grid_backward_call;
 SW_OPERATION(sw_codecs, grid_backward);
 
@@ -77,6 +79,8 @@ typedef struct {
   const float* gradient;    // [count, row]
   int64_t row;
   int64_t first;
+  const float* largest;     // or null: on a GPU one number that none of `gradient` exceeds, for sums the same in any order
+  int64_t* sums;            // [entries, features] or null: with it zeros
 } signs_backward_call;
 SW_OPERATION(sw_codecs, signs_backward);
 
