@@ -3,8 +3,8 @@
 import pytest
 import torch
 
+from splatwizard_native import Repeated
 from sw_rasterizers import face
-from sw_rasterizers.repeated import Repeated
 
 
 def arguments(seed, count=5):

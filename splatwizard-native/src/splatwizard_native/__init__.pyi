@@ -22,6 +22,7 @@ from splatwizard_native.lock import HeldError as HeldError
 from splatwizard_native.lock import file_lock as file_lock
 from splatwizard_native.lock import read_holder as read_holder
 from splatwizard_native.module import NativeModule as NativeModule
+from splatwizard_native.repeated import Repeated as Repeated
 from splatwizard_native.settings import cache_root as cache_root
 from splatwizard_native.settings import fast_enabled as fast_enabled
 from splatwizard_native.toolchain import Toolchain as Toolchain

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from splatwizard_native import AdamUpdate, NativeBuildError
+from splatwizard_native import AdamUpdate, NativeBuildError, Repeated
 from sw_rasterizers import cuda_face
 from sw_rasterizers.call import BACKWARD_STAGES, FORWARD_STAGES, Call, Flag
 from sw_rasterizers.cpu import (
@@ -24,7 +24,6 @@ from sw_rasterizers.cpu import (
     most_pairs,
 )
 from sw_rasterizers.native import MODULE, unavailable_on_cuda
-from sw_rasterizers.repeated import Repeated
 
 BYTES, COUNT, FOR_SCORES, ORDERED = map(int, (Flag.BYTES, Flag.COUNT, Flag.FOR_SCORES, Flag.ORDERED))
 NUMBERED = (1 << 31) - 1025

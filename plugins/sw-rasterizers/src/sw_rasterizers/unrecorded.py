@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.api import Camera, ConfigError, GaussianInputs, RasterizerInfo, RasterOptions
+from splatwizard_native import Repeated
 from sw_rasterizers import cpu, cuda, cuda_face
 from sw_rasterizers.call import INPUTS, Call, Flag, camera_numbers
 from sw_rasterizers.ops import gradients_on_cuda, updates_of
-from sw_rasterizers.repeated import Repeated
 
 Drawing = tuple[Tensor, Tensor, "Tensor | None", "Tensor | None", "Tensor | None"]
 """Image, radii, and where they were asked for alpha, median depth, maps of surfels."""

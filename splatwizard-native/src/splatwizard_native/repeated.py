@@ -26,7 +26,7 @@ class Repeated:
         """Call it, and return its struct, each time the same one.
 
         fixed   gives the arguments that are the same at all calls
-        changed tensors of the form that those of the first call had, numbers, tuples of them
+        changed tensors of the form that those of the first call had, lists of them, numbers, tuples of numbers
         """
         call: Any = self._call
         if call is None:
@@ -36,7 +36,9 @@ class Repeated:
             self._function = getattr(module.library, f"{module.name}_{self._name}")
             return call
         for name, value in changed.items():
-            setattr(call, name, value if value is None or type(value) in PLAIN else value.data_ptr())
+            if value is not None and type(value) not in PLAIN:
+                value = tuple([x.data_ptr() for x in value]) if type(value) is list else value.data_ptr()
+            setattr(call, name, value)
         if call.device >= 0:
             call.stream = torch._C._cuda_getCurrentRawStream(call.device)
         if self._function(self._reference) != 0:
