@@ -223,12 +223,9 @@ def test_anchors(calls, monkeypatch):
     (put,) = torch.autograd.grad(taken[1], features, rand(2, inputs))
     assert put.shape == features.shape
     rows.add_rows(index, [rand(2, 6)], [scales.detach()])
-    assert [(call.way, call.tensors, call.count) for call in calls["copy_rows"]] == [
-        (0, 2, 2),
-        (0, 2, 2),
-        (1, 1, 2),
-        (2, 1, 2),
-    ]
+    copied = [(call.way, call.tensors, call.count, call.cleared) for call in calls["copy_rows"]]
+    assert copied == [(0, 2, 2, 0), (0, 2, 2, 0), (1, 1, 2, n), (2, 1, 2, 0)]
+    assert list(calls["copy_rows"][1].source_rows[:3]) == [3, inputs + 9, 0]
     with pytest.raises(RuntimeError, match="2 rows of"):
         rows.add_rows(index, [rand(2, 5)], [scales.detach()])
 
@@ -244,6 +241,60 @@ def test_anchors(calls, monkeypatch):
     assert (there.threshold, back.steps) == (0.01, each_step.data_ptr())
     assert (back.count, back.width, back.k, back.step_rows) == (n, inputs, k, n)
     assert (list(back.by_rows), back.by_scales) == ([numbers, inputs, 0, 0, k], None)
+
+
+def test_rows_that_are_alike_are_checked_once(calls):
+    from sw_anchors.fast.rows import AlikeRows, Way
+
+    load, put, add = AlikeRows(Way.GATHER), AlikeRows(Way.SCATTER), AlikeRows(Way.ADD)
+    into = [rand(4, 3), rand(4, 6)]
+    for count in (3, 2):
+        rows, sources = torch.arange(count), [rand(9, 3), rand(9, 2, 3)]
+        load.load(rows, sources, into)
+        call = calls["copy_rows"][-1]
+        assert (call.way, call.tensors, call.count, call.cleared, call.rows) == (0, 2, count, 0, rows.data_ptr())
+        assert list(call.sources[:3]) == [*(x.data_ptr() for x in sources), None]
+        assert list(call.targets[:3]) == [*(x.data_ptr() for x in into), None]
+        assert list(call.words[:3]) == list(call.source_rows[:3]) == list(call.target_rows[:3]) == [3, 6, 0]
+
+        first, none, last = put.put(rows, [into[0], None, into[1]], [torch.Size(x) for x in ((7, 3), (7,), (7, 2, 3))])
+        call = calls["copy_rows"][-1]
+        assert (none, first.shape, last.shape) == (None, (7, 3), (7, 2, 3))
+        assert (call.way, call.count, call.cleared, call.targets[1]) == (1, count, 7, last.data_ptr())
+
+        totals = [rand(7, 3), None, rand(7, 2, 3)]
+        add.add(rows, [into[0], into[0], into[1]], totals)
+        call = calls["copy_rows"][-1]
+        assert (call.way, call.tensors, call.cleared, call.targets[1]) == (2, 2, 0, totals[2].data_ptr())
+    for more in (rand(9, 3)[:, :2], rand(9, 3).double()):  # of another form: checked anew
+        load.load(torch.arange(2), [more, rand(9, 6)], [rand(4, more.shape[1]).to(more.dtype), rand(4, 6)])
+    assert [call.words[0] for call in calls["copy_rows"][6:]] == [2]  # eight bytes a number: by torch
+    before = len(calls["copy_rows"])
+    with pytest.raises((IndexError, RuntimeError)):
+        load.load(torch.arange(5), [rand(9, 3), rand(9, 6)], into)
+    assert len(calls["copy_rows"]) == before
+
+
+def test_gaussians_that_are_alike_are_checked_once(calls):
+    from sw_anchors.fast.spawn import AlikeGaussians
+
+    kept, n, k = AlikeGaussians(), 5, 4
+    for m in (3, 2):
+        matrix, drawn = rand(n, 40), torch.arange(m)
+        given = (rand(n, k), rand(n, 7 * k), rand(n, 3 * k), rand(n, 3), matrix[:, 6:18].view(n, k, 3), matrix[:, :6],
+                 rand(n, k))  # fmt: skip
+        found = kept.spawned(drawn, given)
+        assert [x.shape for x in found] == [(m, 3), (m,), (m, 3), (m, 4), (m, 3)]
+        into = [rand(n, k), rand(n, 7 * k), rand(n, 3 * k), rand(n, k, 3), rand(n, 6), rand(n, k)]
+        kept.add_gradients(drawn, given, found, into)
+        there, back = calls["spawn"][-1], calls["spawn_backward"][-1]
+        assert (there.n, there.k, there.count, there.drawn) == (n, k, m, drawn.data_ptr())
+        assert (there.offset_row, there.scale_row, there.offsets) == (40, 40, given[4].data_ptr())
+        assert (there.alpha, there.masks, there.colors) == (*(x.data_ptr() for x in (given[0], given[6], found[4])),)
+        assert (back.count, back.by_colors, back.to_positions, back.ordered) == (m, there.colors, None, False)
+        assert (back.to_alpha, back.to_masks) == (into[0].data_ptr(), into[5].data_ptr())
+    with pytest.raises(RuntimeError, match="positions must be"):
+        AlikeGaussians().spawned(drawn, (*given[:3], rand(n, 2), *given[4:]))
 
 
 LEVELS = [4.0, 8.0], [5, 9], [0, 216], [1, 0], 9

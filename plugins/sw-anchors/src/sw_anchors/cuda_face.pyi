@@ -6,13 +6,6 @@ from typing import Any
 
 from torch import Tensor
 
-class row_copy(Structure):
-    source: int | None
-    target: int | None
-    words: int
-    source_row: int
-    target_row: int
-
 class view_networks_sizes_call(Structure):
     parts: int
     part: int
@@ -92,10 +85,15 @@ def sample_bits(
 ) -> Structure: ...
 def copy_rows(
     *,
-    copies: Tensor | Array[Any] | int,
+    sources: Sequence[Tensor | Array[Any] | int | None],
+    targets: Sequence[Tensor | Array[Any] | int | None],
+    words: Sequence[int],
+    source_rows: Sequence[int],
+    target_rows: Sequence[int],
     tensors: int,
     rows: Tensor | Array[Any] | int,
     count: int | None = None,
+    cleared: int,
     way: int,
     device: int | None = None,
 ) -> Structure: ...

@@ -18,6 +18,7 @@ from sw_anchors.fast import rows as fast_rows
 
 MAX_LOG_BASE_SCALE = 0.05
 """Upper bound of the log base scales (columns 3 to 5), applied at every adjustment."""
+_OF_ANCHORS, _OF_OFFSETS = fast_rows.AlikeRows(fast_rows.Way.ADD), fast_rows.AlikeRows(fast_rows.Way.ADD)
 
 
 @dataclass(frozen=True)
@@ -42,10 +43,11 @@ def accumulate_anchor_statistics(
     # Every index occurs once, and what was not drawn adds 0: a mask as an index would be waited for on a GPU.
     rows, seen = selection.rows, (radii > 0).to(model.offset_denom)
     sums = selection.opacities.clamp(min=0).sum(dim=1), model.anchor_denom.new_ones(len(rows))
-    add = fast_rows.add_rows if fast_rows.fit_kernels(model.opacity_accum) else add_rows
-    add(rows, sums, (model.opacity_accum, model.anchor_denom))
+    fits = fast_rows.fit_kernels(model.opacity_accum)
+    (_OF_ANCHORS.add if fits else add_rows)(rows, sums, (model.opacity_accum, model.anchor_denom))
     norms = torch.linalg.vector_norm(gradients, dim=1).to(model.offset_grad_accum)
     totals = model.offset_grad_accum.view(-1), model.offset_denom.view(-1)
+    add = _OF_OFFSETS.add if fits else add_rows
     add(selection.offset_index(), (norms.masked_fill_(seen == 0, 0), seen), totals)
 
 

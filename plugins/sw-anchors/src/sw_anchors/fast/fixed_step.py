@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import torch
@@ -18,9 +18,8 @@ from torch import Tensor, nn
 
 from splatwizard_core.api import Camera, GaussianInputs
 from sw_anchors.fast.networks import network_outputs
-from sw_anchors.fast.rows import load_rows, noisy_rows, take_rows
+from sw_anchors.fast.rows import AlikeRows, Way, noisy_rows, take_rows
 from sw_anchors.fast.seen_rows import SeenRows
-from sw_anchors.fast.spawn import visible_gaussians
 from sw_anchors.neural_gaussians import NeuralGaussians
 from sw_anchors.noisy_values import ENTROPY, MASK_THRESHOLD, QUANTIZED
 from sw_anchors.rate_model import AnchorForecast, AnchorRate, RateInputs, RateModel
@@ -92,6 +91,7 @@ class FixedRows:
     weights     [C,1] of the masks, or None
     parts       rows of the model's `context_rows`
     random      [C (numbers of an anchor + 1)] draws of U(-1/2, 1/2): noise of all numbers, then one for the sample
+    copying     of the rows, for all loads
     """
 
     count: Tensor
@@ -101,17 +101,16 @@ class FixedRows:
     weights: Tensor | None
     parts: tuple[Tensor, ...]
     random: Tensor
+    copying: AlikeRows = field(default_factory=lambda: AlikeRows(Way.GATHER))
 
     def load(self, model: Model, camera: Camera, rows: SeenRows, parts: Sequence[Tensor]) -> None:
         """Copy the anchors `rows` of the model into the buffers of capacity C, and draw new noise."""
         rows.write_number(self.count)
         self.center.copy_(camera.center)
-        weights = model.mask_weights()
-        pairs = [(model.positions(), self.positions), *zip(parts, self.parts, strict=True)]
-        pairs += [(getattr(model, name).detach(), mine) for name, mine in zip(PARAMETERS, self.parameters, strict=True)]
-        if weights is not None and self.weights is not None:
-            pairs.append((weights, self.weights))
-        load_rows(rows.loaded, [source for source, _ in pairs], [mine.detach() for _, mine in pairs])
+        weights = () if self.weights is None else (model.mask_weights(),)
+        sources = [model.positions(), *parts, *(getattr(model, name) for name in PARAMETERS), *weights]
+        into = [self.positions, *self.parts, *self.parameters, *(() if self.weights is None else (self.weights,))]
+        self.copying.load(rows.loaded, sources, into)
         self.draw(model)
 
     def draw(self, model: Model) -> None:
@@ -129,6 +128,7 @@ class PoolRows:
     parameters  rows of PARAMETERS, those of offsets flat; they take gradients
     parts       rows of the model's `context_rows`
     random      [S (numbers of an anchor)] draws of U(-1/2, 1/2)
+    copying     of the rows, for all loads
     """
 
     rows: Tensor
@@ -137,6 +137,7 @@ class PoolRows:
     parameters: tuple[Tensor, ...]
     parts: tuple[Tensor, ...]
     random: Tensor
+    copying: AlikeRows = field(default_factory=lambda: AlikeRows(Way.GATHER))
 
     @torch.no_grad()
     def load(self, model: Model, sources: Sequence[Tensor], parts: Sequence[Tensor]) -> None:
@@ -145,7 +146,7 @@ class PoolRows:
         self.rows.copy_(rows)
         self.counted.copy_(counted)
         self.size.fill_(len(self.rows))
-        load_rows(self.rows, [*sources, *parts], [*(mine.detach() for mine in self.parameters), *self.parts])
+        self.copying.load(self.rows, [*sources, *parts], [*self.parameters, *self.parts])
         self.draw(model)
 
     def draw(self, model: Model) -> None:
@@ -242,18 +243,3 @@ def bernoulli_rows(uniform: Tensor, count: int, share: float) -> tuple[Tensor, T
         gaps = uniform.log().mul_(-1 / rate).floor_().add_(1).clamp_(max=count + 1).to(torch.int64)
     places = gaps.cumsum(0)  # from 1 on; of floats a GPU may sum in any order
     return places.clamp(max=count).sub_(1), (places <= count).to(uniform)
-
-
-def inputs_of(model: Model, at: FixedRows, rows: SeenRows, found: Found) -> GaussianInputs | None:
-    """Return the Gaussians with opacity > 0 from the results of `decode_rows`; `rows` are the loaded anchors.
-
-    None: more anchors are seen than there were places for. Waits for the device once, for the number of Gaussians.
-    """
-    (alpha, geometry, color, offsets, scales, masks, *rate), counts = found
-    spawned = visible_gaussians(alpha, geometry, color, at.positions, offsets, scales, masks)
-    if not rows.fit():
-        return None
-    extras: dict[str, Any] = {}
-    if rate:
-        extras["rate"] = AnchorRate(rate[0], counts[0], counts[1], rate[1] if len(rate) > 1 else None)
-    return model.drawn(rows.placed(), spawned, masks, extras)

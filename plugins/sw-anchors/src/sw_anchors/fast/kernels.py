@@ -41,7 +41,7 @@ def zeros_together(shapes: Sequence[tuple[int, ...]], like: Tensor) -> list[Tens
     return [whole[at : at + count].view(shape) for at, count, shape in zip(starts, counts, shapes, strict=False)]
 
 
-def room_for_gaussians(count: int, like: Tensor) -> tuple[Tensor, ...]:
-    """Return memory for means, opacities, scales, quaternions and colours, float32 on the device of `like`."""
-    shapes = (count, 3), (count,), (count, 3), (count, 4), (count, 3)
-    return tuple(like.new_empty(shape, dtype=torch.float32) for shape in shapes)
+def room_for_gaussians(count: int, like: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Return memory for means, opacities, scales, quaternions and colours, with dtype and device of `like`."""
+    new = like.new_empty
+    return new(count, 3), new(count), new(count, 3), new(count, 4), new(count, 3)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import logging
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -27,13 +27,16 @@ from sw_anchors.fast.fixed_step import (
     FixedRows,
     PoolRows,
     decode_rows,
-    inputs_of,
     sample_capacity,
 )
-from sw_anchors.fast.rows import add_rows, put_rows
+from sw_anchors.fast.kernels import room_for_gaussians
+from sw_anchors.fast.rows import AlikeRows, Way
 from sw_anchors.fast.seen_rows import AnchorOrder, ExpectedRows, SeenRows, capacity_of
+from sw_anchors.fast.spawn import AlikeGaussians, drawn_of
 from sw_anchors.native import ANCHORS
+from sw_anchors.neural_gaussians import NeuralGaussians
 from sw_anchors.noisy_values import ENTROPY
+from sw_anchors.rate_model import AnchorRate
 
 log = logging.getLogger(__name__)
 
@@ -41,6 +44,9 @@ CAPACITY_MARGIN = 1.04
 """Head-room over the number of anchors that this camera saw last time."""
 MAX_STEPS = 16
 """Steps kept per model; the views of one scene ask for fewer capacities."""
+
+GAUSSIANS, OUTPUTS = 5, 6
+"""Numbers of tensors that spawned Gaussians have, and of those of `decode_rows` that they are spawned from."""
 
 Model = Any
 """A `CodedAnchors`, which imports this: see `fixed_step.Model`."""
@@ -72,11 +78,17 @@ def release(model: Model) -> None:
 
 @dataclass(frozen=True)
 class _Prepared:
-    """A step of one size, what it reads of the visible anchors, and of a sample of all."""
+    """A step of one size, what it reads of the visible anchors, and of a sample of all; what calls of it have kept.
+
+    put, add    of gradients to their places among all anchors
+    """
 
     step: FixedStep
     at: FixedRows
     pool: PoolRows | None
+    gaussians: AlikeGaussians = field(default_factory=AlikeGaussians)
+    put: AlikeRows = field(default_factory=lambda: AlikeRows(Way.SCATTER))
+    add: AlikeRows = field(default_factory=lambda: AlikeRows(Way.ADD))
 
 
 class FixedDecoder:
@@ -169,9 +181,8 @@ class FixedDecoder:
             at.load(model, camera, rows, parts)
             if pool is not None:
                 pool.load(model, [source.detach() for source in sources], parts)
-        pool_rows = None if pool is None else pool.rows
-        results, others = _Decoded.found(prepared.step, rows, pool_rows, self._watched.learning, sources)
-        return inputs_of(model, at, rows, (results, others))
+        spawned, masks, extras = _Decoded.found(prepared, rows, self._watched.learning, sources)
+        return model.drawn(rows.placed(), spawned, masks, extras) if rows.fit() else None
 
     def _prepared(self, model: Model, parts: tuple[Tensor, ...], capacity: int, places: int) -> _Prepared:
         rate_model = model.rate_model if model.phase == ENTROPY else None
@@ -252,59 +263,59 @@ DECODERS: WeakKeyDictionary[Any, FixedDecoder] = WeakKeyDictionary()
 
 
 class _Decoded(torch.autograd.Function):
-    """Results of a FixedStep, with the gradients of rows at their places among all anchors.
+    """The Gaussians with opacity > 0 of a FixedStep, with the gradients of rows at their places among all anchors.
 
     Those of networks are not returned but added where the optimizer looks for them.
     """
 
     @classmethod
     def found(
-        cls,
-        step: FixedStep,
-        rows: SeenRows,
-        pool: Tensor | None,
-        networks: list[Tensor],
-        sources: list[Tensor],
-    ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
-        """(differentiable results, others). rows: of the visible anchors; pool: perhaps of a sample of all."""
-        counts: list[int] = []
-        found = cls.apply(step, rows, pool, networks, counts, *sources)  # type: ignore[no-untyped-call]
-        return found[: counts[0]], found[counts[0] :]
+        cls, prepared: _Prepared, rows: SeenRows, networks: list[Tensor], sources: list[Tensor]
+    ) -> tuple[NeuralGaussians, Tensor, dict[str, Any]]:
+        """(Gaussians, masks [C,k], perhaps the rate) of the loaded anchors `rows`. Waits for the device once."""
+        beside: list[Any] = []
+        found = cls.apply(prepared, rows, networks, beside, *sources)  # type: ignore[no-untyped-call]
+        (opacities, alphas, drawn, counts), (masks, *rate) = beside, found[GAUSSIANS:]
+        extras = {"rate": AnchorRate(rate[0], *counts, *rate[1:])} if rate else {}
+        return NeuralGaussians(*found[:GAUSSIANS], opacities, alphas, drawn), masks, extras
 
     @staticmethod
     def forward(
-        ctx: Any,
-        step: FixedStep,
-        rows: SeenRows,
-        pool: Tensor | None,
-        networks: list[Tensor],
-        counts: list[int],
-        *sources: Tensor,
+        ctx: Any, prepared: _Prepared, rows: SeenRows, networks: list[Tensor], beside: list[Any], *sources: Tensor
     ) -> tuple[Tensor, ...]:
-        results, others = step.forward()
-        ctx.step, ctx.networks, ctx.count, ctx.rows = step, networks, len(results), rows
+        results, others = prepared.step.forward()
+        alpha, geometry, color, offsets, scales, masks = results[:OUTPUTS]
+        opacities, drawn = drawn_of(alpha, masks)
+        ctx.given = alpha, geometry, color, prepared.at.positions, offsets, scales, masks
+        ctx.prepared, ctx.rows, ctx.networks, ctx.drawn = prepared, rows, networks, drawn
         ctx.shapes = [source.shape for source in sources]
-        ctx.save_for_backward(pool)
         ctx.set_materialize_grads(False)
-        counts.append(len(results))
-        results, others = tuple(each.detach() for each in results), tuple(each.detach() for each in others)
-        ctx.mark_non_differentiable(*others)
-        return *results, *others
+        beside += opacities, alpha.detach(), drawn, [each.detach() for each in others]
+        rest = [each.detach() for each in results[OUTPUTS - 1 :]]  # masks, and perhaps the rate
+        return *prepared.gaussians.spawned(drawn, ctx.given), *rest
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *slopes: Tensor | None) -> tuple[Tensor | None, ...]:
-        (pool,) = ctx.saved_tensors
-        rows, count = ctx.rows, len(ctx.shapes)
-        grads = ctx.step.backward(slopes[: ctx.count])
-        add_gradients(ctx.networks, grads[count * (1 if pool is None else 2) :])
-        found = put_rows(rows.placed(), grads[:count], ctx.shapes[0][0])
-        if pool is not None:
+        prepared, drawn, count = ctx.prepared, ctx.drawn, len(ctx.shapes)
+        of_gaussians, to_masks, rate = slopes[:GAUSSIANS], slopes[GAUSSIANS], slopes[GAUSSIANS + 1 :]
+        into = prepared.step.room()[:OUTPUTS]
+        if any(slope is not None for slope in of_gaussians):
+            whole = [None if slope is None else slope.contiguous() for slope in of_gaussians]
+            if any(slope is None for slope in whole):
+                forms = room_for_gaussians(len(drawn), ctx.given[0])
+                whole = [form.zero_() if slope is None else slope for form, slope in zip(forms, whole, strict=True)]
+            prepared.gaussians.add_gradients(drawn, ctx.given, whole, into)
+        if to_masks is not None:
+            into[-1].add_(to_masks)
+        grads = prepared.step.backward([*into, *rate])
+        add_gradients(ctx.networks, grads[count * (1 if prepared.pool is None else 2) :])
+        found = prepared.put.put(ctx.rows.placed(), grads[:count], ctx.shapes)
+        if prepared.pool is not None:
             own = grads[count : 2 * count]
             found = [
-                grad.new_zeros(ctx.shapes[0][0], *grad.shape[1:]) if into is None and grad is not None else into
-                for into, grad in zip(found, own, strict=True)
+                grad.new_zeros(shape) if into is None and grad is not None else into
+                for into, grad, shape in zip(found, own, ctx.shapes, strict=True)
             ]
-            add_rows(pool, own, found)
-        shaped = (None if grad is None else grad.view(shape) for grad, shape in zip(found, ctx.shapes, strict=True))
-        return None, None, None, None, None, *shaped
+            prepared.add.add(prepared.pool.rows, own, found)
+        return None, None, None, None, *found

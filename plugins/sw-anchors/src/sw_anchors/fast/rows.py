@@ -7,6 +7,7 @@ its index on the way back). Elsewhere the same by torch operations.
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Sequence
 from enum import IntEnum
 from typing import Any
@@ -15,9 +16,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from splatwizard_native import fast_enabled
+from splatwizard_native import Repeated, fast_enabled
 from sw_anchors import cuda_face
-from sw_anchors.fast.kernels import zeros_together
 from sw_anchors.native import ANCHORS
 from sw_anchors.shape import AnchorShape
 from sw_codecs.quantizers.straight_through import hard_mask
@@ -47,7 +47,7 @@ def take_rows(rows: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
 def load_rows(rows: Tensor, sources: Sequence[Tensor], into: Sequence[Tensor]) -> None:
     """Copy rows [V] (int64) of each source [N,...], flat, into the first V rows of its target [V or more, ...]."""
     if fit_kernels(*sources) and fit_kernels(*into):
-        _copy(rows, sources, into, Way.GATHER)
+        cuda_face.copy_rows(**_copied(rows, sources, into, Way.GATHER))
         return
     for source, mine in zip(sources, into, strict=True):
         flat = source if source.dim() == mine.dim() else source.flatten(1)
@@ -58,13 +58,12 @@ def put_rows(rows: Tensor, sources: Sequence[Tensor | None], count: int) -> list
     """For each source [V or more,...] `count` rows of zeros, of which `rows` [V] are its first V; None for None."""
     given = [source for source in sources if source is not None]
     if fit_kernels(*given):
-        room = zeros_together([(count, *source.shape[1:]) for source in given], rows)
-        _copy(rows, given, room, Way.SCATTER)
-        found = iter(room)
-        return [None if source is None else next(found) for source in sources]
-    return [
-        None if s is None else s.new_zeros(count, *s.shape[1:]).index_copy_(0, rows, s[: len(rows)]) for s in sources
-    ]
+        found = [source.new_empty(count, *source.shape[1:]) for source in given]
+        cuda_face.copy_rows(**_copied(rows, given, found, Way.SCATTER, cleared=count))
+    else:
+        found = [s.new_zeros(count, *s.shape[1:]).index_copy_(0, rows, s[: len(rows)]) for s in given]
+    each = iter(found)
+    return [None if source is None else next(each) for source in sources]
 
 
 def add_rows(rows: Tensor, sources: Sequence[Tensor | None], into: Sequence[Tensor | None]) -> None:
@@ -76,42 +75,102 @@ def add_rows(rows: Tensor, sources: Sequence[Tensor | None], into: Sequence[Tens
     pairs = [(s, t) for s, t in zip(sources, into, strict=True) if s is not None and t is not None]
     given, targets = [s for s, _ in pairs], [t for _, t in pairs]
     if fit_kernels(*given) and fit_kernels(*targets):
-        _copy(rows, given, targets, Way.ADD)
+        cuda_face.copy_rows(**_copied(rows, given, targets, Way.ADD))
         return
     for source, target in pairs:
-        target.index_add_(0, rows, source)
+        target.view(-1, *source.shape[1:]).index_add_(0, rows, source)
 
 
 def gathered(rows: Tensor, tensors: Sequence[Tensor]) -> list[Tensor]:
     """Rows [S] (int64) of each tensor [N,...], which may be named more than once; without gradients."""
     if fit_kernels(*tensors):
         found = [t.new_empty(len(rows), *t.shape[1:]) for t in tensors]
-        _copy(rows, tensors, found, Way.GATHER)
+        cuda_face.copy_rows(**_copied(rows, tensors, found, Way.GATHER))
         return found
     return [t.index_select(0, rows) for t in tensors]
 
 
 class Way(IntEnum):
-    """Direction of `_copy`: `way` of kernels/cuda/face.h."""
+    """Direction in which rows are copied: `way` of kernels/cuda/face.h."""
 
     GATHER = 0
     SCATTER = 1
     ADD = 2
 
 
-def _copy(rows: Tensor, sources: Sequence[Tensor], targets: Sequence[Tensor], way: Way) -> None:
-    """Copy or add rows of tensors that fit the kernels. RuntimeError for rows of other sizes, or too few of them."""
-    copies, count, gather = [], len(rows), way is Way.GATHER
-    for source, target in zip(sources, targets, strict=True):
-        words = math.prod(source.shape[1:])
-        if words != math.prod(target.shape[1:]) or len(target if gather else source) < count:
+def _copied(
+    rows: Tensor, sources: Sequence[Tensor], targets: Sequence[Tensor], way: Way, cleared: int = 0
+) -> dict[str, Any]:
+    """Arguments of `copy_rows` for tensors that fit the kernels. RuntimeError for rows of other sizes, or too few."""
+    count, gather, words = len(rows), way is Way.GATHER, [math.prod(source.shape[1:]) for source in sources]
+    for source, target, own in zip(sources, targets, words, strict=True):
+        if own != math.prod(target.shape[1:]) or len(target if gather else source) < count:
             raise RuntimeError(f"{count} rows of {list(source.shape)} do not fit into {list(target.shape)}")
         if not gather and (source.dtype, target.dtype) != (torch.float32, torch.float32):
             raise RuntimeError(f"float32 rows are put and added, not {source.dtype} to {target.dtype}")
-        far = [words if t.is_contiguous() else t.stride(0) for t in (source, target)]
-        copies.append((source.data_ptr(), target.data_ptr(), words, *far))
-    listed: Any = cuda_face.row_copy * len(copies)
-    cuda_face.copy_rows(copies=listed(*copies), tensors=len(copies), rows=rows.contiguous(), way=int(way))
+    far = [[n if t.is_contiguous() else t.stride(0) for t, n in zip(x, words, strict=True)] for x in (sources, targets)]
+    return {
+        "sources": sources, "targets": targets, "words": words, "source_rows": far[0], "target_rows": far[1],
+        "tensors": len(words), "rows": rows.contiguous(), "cleared": cleared, "way": int(way),
+    }  # fmt: skip
+
+
+class AlikeRows(threading.local):
+    """Copies of rows that are alike at each step of a training: a thread's first is checked, others for its form.
+
+    Where there is no kernel for them they are those of `load_rows`, `put_rows` and `add_rows`.
+    """
+
+    def __init__(self, way: Way) -> None:
+        self._way = way
+        self._form: list[Any] | None = None
+        self._call: Repeated | None = None
+
+    def load(self, rows: Tensor, sources: Sequence[Tensor], into: Sequence[Tensor]) -> None:
+        """As `load_rows`; the targets are the same each time."""
+        if not self._copy(rows, sources, into, sources, into[0].shape[0]):
+            load_rows(rows, sources, into)
+
+    def put(self, rows: Tensor, sources: Sequence[Tensor | None], shapes: Sequence[torch.Size]) -> list[Tensor | None]:
+        """As `put_rows`, where the results have these shapes."""
+        given = [(source, shape) for source, shape in zip(sources, shapes, strict=True) if source is not None]
+        own, found = [source for source, _ in given], [source.new_empty(shape) for source, shape in given]
+        if given and not self._copy(rows, own, found, own, own[0].shape[0], cleared=shapes[0][0]):
+            plain = put_rows(rows, own, shapes[0][0])
+            found = [x.view(shape) for x, (_, shape) in zip(plain, given, strict=True) if x is not None]
+        each = iter(found)
+        return [None if source is None else next(each) for source in sources]
+
+    def add(self, rows: Tensor, sources: Sequence[Tensor | None], into: Sequence[Tensor | None]) -> None:
+        """As `add_rows`; rows of a source may be flat."""
+        pairs = [(s, t) for s, t in zip(sources, into, strict=True) if s is not None and t is not None]
+        given, targets = [s for s, _ in pairs], [t for _, t in pairs]
+        if given and not self._copy(rows, given, targets, (*given, *targets), given[0].shape[0]):
+            add_rows(rows, given, targets)
+
+    def _copy(
+        self,
+        rows: Tensor,
+        sources: Sequence[Tensor],
+        targets: Sequence[Tensor],
+        looked_at: Sequence[Tensor],
+        most: int,
+        cleared: int = 0,
+    ) -> bool:
+        """Copy at most `most` rows, if there are kernels; others are alike wherever those that are looked at are."""
+        # The first stride of what is contiguous tells the size of a row.
+        form = [looked_at[0].get_device(), *(x for t in looked_at for x in (t.dtype, t.stride()))]
+        if form != self._form:
+            fits = fit_kernels(*sources) and fit_kernels(*targets)
+            alike = fits and all(t.is_contiguous() for t in (*sources, *targets))
+            self._form, self._call = form, Repeated(cuda_face, "copy_rows") if alike else None
+        count = rows.shape[0]
+        if self._call is None or count > most:
+            return False
+        now = {"sources": list(sources), "targets": list(targets), "rows": rows, "count": count, "cleared": cleared}
+        kept = lambda: {x: y for x, y in _copied(rows, sources, targets, self._way).items() if x not in now}  # noqa: E731
+        self._call(kept, **now)
+        return True
 
 
 class _TakeRows(torch.autograd.Function):

@@ -32,10 +32,14 @@ class FixedStep(Protocol):
         """Compute from the inputs as they are now; the tensors hold until the next call."""
         ...
 
+    def room(self) -> Sequence[Tensor]:
+        """Zeros, one for each differentiable result of `forward`: room for the gradients of one call of `backward`."""
+        ...
+
     def backward(self, slopes: Sequence[Tensor | None]) -> tuple[Tensor | None, ...]:
         """Gradients of the inputs (None: it has none) for the gradients of the differentiable results of `forward`.
 
-        They hold until the next call; every result of `forward` is still as it was.
+        They hold until the next call; every result of `forward` is still as it was. What `room` gave is not copied.
         """
         ...
 
@@ -51,6 +55,9 @@ class PlainStep:
         with torch.enable_grad():
             self._results, others = self._compute()
         return self._results, others
+
+    def room(self) -> Sequence[Tensor]:
+        return [torch.zeros_like(each) for each in self._results]
 
     def backward(self, slopes: Sequence[Tensor | None]) -> tuple[Tensor | None, ...]:
         results, self._results = self._results, ()
@@ -85,7 +92,9 @@ class CapturedStep:
             with _recording(self._forward, pool):
                 results, others = compute()
             with _recording(self._backward, pool):
-                self._grads = differentiate(results, inputs, self._slopes)
+                found, room = differentiate(results, inputs, self._slopes), {storage_of(x) for x in self._slopes}
+                self._grads = tuple(x.clone() if x is not None and storage_of(x) in room else x for x in found)
+                torch._foreach_zero_(self._slopes)  # for the next time
         current.wait_stream(stream)
         # What backward needs of forward stays where it is, though nothing holds it: the graphs keep the pool, and its
         # next capture may take the place, whose replays then come between no forward and backward of this one.
@@ -95,14 +104,21 @@ class CapturedStep:
         self._forward.replay()
         return self._found
 
+    def room(self) -> Sequence[Tensor]:
+        return self._slopes
+
     def backward(self, slopes: Sequence[Tensor | None]) -> tuple[Tensor | None, ...]:
-        given = [(mine, slope) for mine, slope in zip(self._slopes, slopes, strict=True) if slope is not None]
-        for mine, slope in zip(self._slopes, slopes, strict=True):
-            if slope is None:
-                mine.zero_()
-        torch._foreach_copy_([mine for mine, _ in given], [slope for _, slope in given])
+        pairs = zip(self._slopes, slopes, strict=True)
+        given = [(mine, slope) for mine, slope in pairs if slope is not None and slope is not mine]
+        if given:
+            torch._foreach_copy_([mine for mine, _ in given], [slope for _, slope in given])
         self._backward.replay()
         return self._grads
+
+
+def storage_of(tensor: Tensor) -> int:
+    """Address of the memory that a tensor shares with its views."""
+    return tensor.untyped_storage().data_ptr()
 
 
 _WARM: set[int] = set()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from sw_anchors.fast.rows import put_rows
+from sw_anchors.fast.rows import AlikeRows, Way
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -27,6 +27,9 @@ class _Masked(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         values, rows = ctx.saved_tensors
-        (to_factors,) = put_rows(rows, [(grad * values).sum(dim=1)], ctx.shape.numel())
+        (to_factors,) = _PUT.put(rows, [(grad * values).sum(dim=1)], [torch.Size([ctx.shape.numel()])])
         assert to_factors is not None
         return grad, to_factors.view(ctx.shape), None
+
+
+_PUT = AlikeRows(Way.SCATTER)

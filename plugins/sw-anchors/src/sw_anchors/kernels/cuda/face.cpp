@@ -20,12 +20,12 @@ RowCopies copies_of(const copy_rows_call& call) {
     refuse("rows of %lld tensors; at most %d are copied together", (long long)call.tensors, kTensors);
   RowCopies copies{};
   for (int64_t i = 0; i < call.tensors; ++i) {
-    const row_copy& own = call.copies[i];
-    if (own.words < 0 || copies.words + own.words >= std::numeric_limits<int>::max())
-      refuse("rows of %lld words", (long long)own.words);
-    copies.words += int(own.words), copies.last[i] = copies.words;
-    copies.from[i] = static_cast<const uint32_t*>(own.source), copies.to[i] = static_cast<uint32_t*>(own.target);
-    copies.from_row[i] = own.source_row, copies.to_row[i] = own.target_row;
+    if (call.words[i] < 0 || copies.words + call.words[i] >= std::numeric_limits<int>::max())
+      refuse("rows of %lld words", (long long)call.words[i]);
+    copies.words += int(call.words[i]), copies.last[i] = copies.words;
+    copies.from[i] = static_cast<const uint32_t*>(call.sources[i]);
+    copies.to[i] = static_cast<uint32_t*>(call.targets[i]);
+    copies.from_row[i] = call.source_rows[i], copies.to_row[i] = call.target_rows[i];
   }
   return copies;
 }
@@ -88,8 +88,10 @@ SW_OPERATION(sw_anchors_cuda, sample_bits) {
 SW_OPERATION(sw_anchors_cuda, copy_rows) {
   return guarded_on_gpu(call, [&](cudaStream_t stream) {
     if (call->way < 0 || call->way > 2) refuse("there is no way %d of copying", int(call->way));
+    const RowCopies copies = copies_of(*call);
+    cuda::clear(copies, call->cleared, stream);
     const auto copy = call->way == 0 ? cuda::gather : call->way == 1 ? cuda::scatter : cuda::add;
-    copy(copies_of(*call), call->rows, call->count, stream);
+    copy(copies, call->rows, call->count, stream);
   });
 }
 

@@ -6,20 +6,19 @@ SW_OPERATION(sw_anchors_cuda, spawn);
 SW_OPERATION(sw_anchors_cuda, spawn_backward);
 SW_OPERATION(sw_anchors_cuda, sample_bits);
 
-// Rows of one tensor that are copied, or added, to those of another: `words` of 4 bytes each, so far apart.
-typedef struct {
-  const void* source;
-  void* target;
-  int64_t words, source_row, target_row;
-} row_copy;
-
-// For rows of all, at most 12: row rows[i] of `source` -> row i of `target`; or the other way; or added there, of float32.
+// For rows of at most 12 tensors: row rows[i] of a source -> row i of its target; or the other way; or added there, of
+// float32.
 typedef struct {
   sw_head head;
-  const row_copy* copies;
+  const void* sources[12];      // strided; rows without gaps, of 4 bytes a number
+  void* targets[12];            // strided, likewise
+  int64_t words[12];            // numbers of a row of each
+  int64_t source_rows[12];      // numbers from one row to the next
+  int64_t target_rows[12];
   int64_t tensors;
   const int64_t* rows;          // [count] each at most once, unless they are added
   int64_t count;
+  int64_t cleared;              // rows of the targets that hold zeros first; 0: what was there stays
   int32_t way;                  // 0: gather, 1: scatter, 2: add
 } copy_rows_call;
 SW_OPERATION(sw_anchors_cuda, copy_rows);

@@ -23,6 +23,15 @@ __global__ void __launch_bounds__(kWarp* kRows)
   }
 }
 
+__global__ void __launch_bounds__(kWarp* kRows) clear_kernel(const __grid_constant__ RowCopies copies, int64_t n) {
+  const int64_t row = own_row();
+  if (row >= n) return;
+  for (int word = int(threadIdx.x), i = 0; word < copies.words; word += kWarp) {
+    while (word >= copies.last[i]) ++i;
+    copies.to[i][row * copies.to_row[i] + word - (i == 0 ? 0 : copies.last[i - 1])] = 0;
+  }
+}
+
 // Row i of each `from` is added to row rows[i] of `to`; rows may be named more than once.
 __global__ void __launch_bounds__(kWarp* kRows)
     add_kernel(const __grid_constant__ RowCopies copies, const int64_t* rows, int64_t n) {
@@ -164,6 +173,10 @@ dim3 threads() { return {kWarp, kRows}; }
 unsigned blocks_of(int64_t rows) { return unsigned((rows + kRows - 1) / kRows); }
 
 }  // namespace
+
+void clear(const RowCopies& copies, int64_t n, cudaStream_t stream) {
+  if (n > 0) clear_kernel<<<blocks_of(n), threads(), 0, stream>>>(copies, n);
+}
 
 void gather(const RowCopies& copies, const int64_t* rows, int64_t n, cudaStream_t stream) {
   if (n > 0) copy_kernel<true><<<blocks_of(n), threads(), 0, stream>>>(copies, rows, n);

@@ -7,6 +7,8 @@
 
 namespace sw_anchors::cuda {
 
+// Zeros in the first n rows of each `to`.
+void clear(const RowCopies& copies, int64_t n, cudaStream_t stream);
 // Row rows[i] of each `from` -> row i of `to`, for n rows.
 void gather(const RowCopies& copies, const int64_t* rows, int64_t n, cudaStream_t stream);
 // Row i of each `from` -> row rows[i] of `to`.
