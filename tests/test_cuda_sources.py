@@ -36,7 +36,7 @@ def test_it_compiles_without_a_torch_header(module, source, checked, tmp_path):
     # Of inline assembly only code that is made tells whether it is any: then to PTX, that nobody optimised.
     made = ["-Xcicc", "-O0"] if re.search(r"\basm\b", path.read_text("utf-8")) else checked
     command = [
-        str(NVCC), "-std=c++20", "-arch=sm_90", *made, "-DSW_WITH_CUDA", "-isystem", str(toolchain.SHARED_INCLUDE),
+        str(NVCC), "-std=c++20", "-arch=sm_90", *made, "-isystem", str(toolchain.SHARED_INCLUDE),
         "-Werror", "all-warnings", "-ptx", str(path), "-o", str(tmp_path / "out.ptx"),
     ]  # fmt: skip
     done = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -18,7 +18,7 @@ MODULES = [resolve_module(target) for target in declared_modules(load_plugins())
 SOURCES = [
     (module, source, is_kernel)
     for module in MODULES
-    if module.face and module.name != "splatwizard_pool"
+    if module.name != "splatwizard_pool"
     for is_kernel, sources in ((False, module.sources), (True, module.kernels))
     for source in sources
 ]

@@ -3,10 +3,10 @@
     python tools/build_cuda_wheel.py [--out dist]
 
 Needs a C++ compiler ($CXX) and nvcc, whose major version N names it: `splatwizard-cudaN`. It pins the versions of
-the packages that it was built from; a library is taken where the sources of its package are the same. Those of torch
-ops (codecs, anchors, HAC) are not in it. $TORCH_CUDA_ARCH_LIST: compute capabilities; else all of ARCHITECTURES that
-nvcc knows, the last one also as PTX, for later GPUs. Two builds by one compiler, in a folder of the same
-name, give the same bytes: nvcc names what is local to a file by the file's path.
+the packages that it was built from; a library is taken where the sources of its package are the same.
+$TORCH_CUDA_ARCH_LIST: compute capabilities; else all of ARCHITECTURES that nvcc knows, the last one also as PTX, for
+later GPUs. Two builds by one compiler, in a folder of the same name, give the same bytes: nvcc names what is local to
+a file by the file's path.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def version_of(package: Path) -> str:
 
 
 def modules() -> Iterator[tuple[Path, build_wheels.Module]]:
-    """Packages with modules for GPUs that have a plain C face, and these."""
+    """Packages with modules for GPUs, and these."""
     for package in build_wheels.packages([]):
         for module in build_wheels.declared(package):
             if module.cuda_sources:

@@ -51,14 +51,14 @@ def packages(names: Sequence[str]) -> list[Path]:
 
 
 def declared(package: Path) -> Iterator[Module]:
-    """The native modules with a plain C face of a package, which has to be on the path."""
+    """The native modules of a package, which has to be on the path."""
     from splatwizard_native import NativeModule
 
     for path in sorted((package / "src").rglob("*.py")):
         for name in DECLARES.findall(path.read_text(encoding="utf-8")):
             relative = path.relative_to(package / "src")
             module = getattr(importlib.import_module(".".join(relative.with_suffix("").parts)), name)
-            if isinstance(module, NativeModule) and module.face:
+            if isinstance(module, NativeModule):
                 yield module
 
 

@@ -11,8 +11,8 @@ def test_build_all_builds_every_target_and_reports_what_fails(package):
     package.write(
         "native.py",
         "from splatwizard_native import NativeModule\n"
-        f"GOOD = NativeModule('good', '{package.folder.name}', ('answer.cpp',), ('*.h',))\n"
-        f"BAD = NativeModule('bad', '{package.folder.name}', ('bad.cpp',))\n"
+        f"GOOD = NativeModule('good', '{package.folder.name}', 'face.h', ('answer.cpp',), ('*.h',))\n"
+        f"BAD = NativeModule('bad', '{package.folder.name}', 'face.h', ('bad.cpp',), ('*.h',))\n"
         "NOT_ONE = 3\n",
     )
     package.write("bad.cpp", "nonsense\n")
@@ -37,7 +37,7 @@ def test_build_all_for_cuda_fails_where_it_would_leave_kernels_out(package, monk
     package.write(
         "native.py",
         "from splatwizard_native import NativeModule\n"
-        f"GPU = NativeModule('gpu', '{package.folder.name}', ('answer.cpp',), cuda_sources=('fill.cu',))\n",
+        f"GPU = NativeModule('gpu', '{package.folder.name}', 'face.h', ('answer.cpp',), cuda_sources=('fill.cu',))\n",
     )
     (row,) = build_all([f"{package.folder.name}.native:GPU"], cuda=True)
     assert (row.state, row.error) == ("failed", "the CUDA kernels of 'gpu' cannot be built: there is none")

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from native_package import call, needs_compiler
+from native_package import answer_of, call, needs_compiler
 
 from splatwizard_native import NativeModule, cuda_toolkit, toolchain
 
@@ -41,7 +41,7 @@ int level() {
 def test_a_portable_build_runs_the_best_kernel_that_this_cpu_has(package):
     package.write("level.h", LEVEL_H)
     package.write("level.cpp", LEVEL_CPP)
-    package.write("answer.cpp", '#include "level.h"\nextern "C" int answer() { return SW_SELECT(level)(); }\n')
+    package.write("answer.cpp", f'#include "level.h"\n{answer_of("SW_SELECT(level)()")}')
     module = package.module(kernels=("level.cpp",))
     library = module.build(march="portable", folder=module.prebuilt_folder)
     assert package.compilations == 4
@@ -58,10 +58,11 @@ def test_a_portable_build_runs_the_best_kernel_that_this_cpu_has(package):
 
 
 @needs_compiler
-def test_kernels_see_their_namespace_and_no_torch_header(package):
+def test_no_file_sees_a_torch_header(package):
+    no_torch = "#if __has_include(<torch/library.h>)\n#error torch\n#endif\n"
     package.write("level.h", LEVEL_H)
-    package.write("level.cpp", "#if __has_include(<torch/library.h>)\n#error torch\n#endif\n" + LEVEL_CPP)
-    package.write("answer.cpp", '#include "level.h"\nextern "C" int answer() { return SW_SELECT(level)(); }\n')
+    package.write("level.cpp", no_torch + LEVEL_CPP)
+    package.write("answer.cpp", f'{no_torch}#include "level.h"\n{answer_of("SW_SELECT(level)()")}')
     assert call(package.module(kernels=("level.cpp",)).build()) in (2, 3, 4)
 
 
@@ -69,27 +70,23 @@ def fake_cuda(package, monkeypatch) -> NativeModule:
     """A module with a kernel of every sort, on a machine of which everything that counts is known."""
     import torch
 
-    for name in ("fill.cu", "binding.cpp", "level.cpp"):
+    for name in ("fill.cu", "second.cpp", "level.cpp"):
         package.write(name, "")
     monkeypatch.setenv("CXX", "g++ -v1")
     monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "8.0 9.0a")
-    monkeypatch.setattr(torch, "__version__", "2.99.0")
     monkeypatch.setattr(torch.version, "cuda", "13.0")
-    monkeypatch.setattr(torch._C, "_GLIBCXX_USE_CXX11_ABI", True)
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.setattr(platform, "machine", lambda: "x86_64")
     monkeypatch.setattr(toolchain, "cpu_identity", lambda: "a CPU")
     monkeypatch.setattr(cuda_toolkit, "find_nvcc", lambda: "/opt/cuda/bin/nvcc")
     monkeypatch.setattr(cuda_toolkit, "nvcc_version", lambda _: (13, 2))
     return package.module(
-        sources=("answer.cpp", "binding.cpp"), kernels=("level.cpp",), cuda_sources=("fill.cu",), cflags=("-fx", "-fy")
+        sources=("answer.cpp", "second.cpp"), kernels=("level.cpp",), cuda_sources=("fill.cu",), cflags=("-fx", "-fy")
     )
 
 
 @pytest.mark.parametrize("march", ["native", "portable"])
 def test_the_command_lines_of_a_build(package, monkeypatch, tmp_path, march):
-    import torch
-
     module = fake_cuda(package, monkeypatch)
     run: list[list[str]] = []
 
@@ -107,9 +104,8 @@ def test_the_command_lines_of_a_build(package, monkeypatch, tmp_path, march):
     library = module.build(march=march, tools=toolchain.Toolchain(1))
     link = run.pop()
     scratch = Path(link[link.index("-o") + 1]).parent
-    lib, include = Path(torch.__file__).parent / "lib", Path(torch.__file__).parent / "include"
     home = cuda_toolkit.root_of("/opt/cuda/bin/nvcc")
-    common = "-std=c++20 -O3 -fPIC -D_GLIBCXX_USE_CXX11_ABI=1 -fopenmp -DSW_WITH_CUDA"
+    common = "-std=c++20 -O3 -fPIC -fvisibility=hidden -fopenmp-simd -pthread"
     if march == "native":
         levels = {"arch_native": "-march=native -mprefer-vector-width=512"}
     else:
@@ -120,45 +116,42 @@ def test_the_command_lines_of_a_build(package, monkeypatch, tmp_path, march):
             "arch_v4": "-march=x86-64-v4 -mprefer-vector-width=512",
         }
     shared = f"-isystem {toolchain.SHARED_INCLUDE}"
-    headers = f"{shared} -isystem {include} -isystem {include}/torch/csrc/api/include -isystem {home}/include"
 
-    def compiled(compiler: str, source: str, name: str) -> str:
-        return f"{compiler} -MD -MF {scratch}/{name}.o.d -c {package.folder}/{source} -o {scratch}/{name}.o"
+    def compiled(compiler: str, source: str, name: str, folder: Path = package.folder) -> str:
+        return f"{compiler} -MD -MF {scratch}/{name}.o.d -c {folder}/{source} -o {scratch}/{name}.o"
 
-    binding = f"g++ -v1 {common} {next(iter(levels.values()))} {headers} -fx -fy"
-    expected = [compiled(binding, "answer.cpp", "0"), compiled(binding, "binding.cpp", "1")]
+    behind = f"g++ -v1 {common} {next(iter(levels.values()))} {shared} -isystem {home}/include -fx -fy"
+    expected = [compiled(behind, "answer.cpp", "0"), compiled(behind, "second.cpp", "1")]
+    expected.append(compiled(behind, "answer.cpp", "2", scratch))  # what the library tells of itself
     for arch, flags in levels.items():
         kernel = f"g++ -v1 {common} {shared} -fx -fy {flags} -DSW_ARCH={arch}"
         expected.append(compiled(kernel, "level.cpp", f"{arch}-0"))
-    nvcc = "/opt/cuda/bin/nvcc -std=c++20 -O3 -Xcompiler -fPIC -DSW_WITH_CUDA -gencode=arch=compute_80,code=sm_80"
+    nvcc = "/opt/cuda/bin/nvcc -std=c++20 -O3 -Xcompiler -fPIC -gencode=arch=compute_80,code=sm_80"
     expected.append(compiled(f"{nvcc} -gencode=arch=compute_90a,code=sm_90a {shared}", "fill.cu", "cuda-0"))
     assert sorted(map(shlex.join, run)) == sorted(expected)
-    objects = " ".join(f"{scratch}/{name}.o" for name in ("0", "1", *(f"{arch}-0" for arch in levels), "cuda-0"))
+    objects = " ".join(f"{scratch}/{name}.o" for name in ("0", "1", "2", *(f"{arch}-0" for arch in levels), "cuda-0"))
+    cuda = f"-L {home}/lib64 -lcudart_static -ldl -lrt"
+    shows = f"-Wl,--version-script={scratch}/shown"
     runtime = "".join(f"{path} " for path in toolchain.runtime_libraries())
-    assert shlex.join(link) == (
-        f"g++ -v1 -shared {objects} -o {scratch}/{library.name} {runtime}-fopenmp -L {lib} -ltorch -ltorch_cpu -lc10 "
-        f"-ltorch_cuda -lc10_cuda -L {home}/lib64 -lcudart"
-    )
+    portable = f"-pthread {cuda} -static-libstdc++ -static-libgcc {shows} -Wl,-s"
+    linked = f"{runtime}-pthread {cuda} {shows}" if march == "native" else portable
+    assert shlex.join(link) == f"g++ -v1 -shared {objects} -o {scratch}/{library.name} {linked}"
     facts = json.loads(library.with_suffix(".json").read_text())
     assert (facts["march"], facts["architectures"], facts["compiler"]) == (march, ["8.0", "9.0a"], "g++ 99")
 
 
-def test_the_cache_key_is_that_of_every_earlier_release(package, monkeypatch):
-    """Else a prebuilt library that ships in a wheel is not found, and every user compiles again."""
+def test_the_cache_key_is_that_of_earlier_releases(package, monkeypatch):
+    """Else every user compiles again."""
     module = fake_cuda(package, monkeypatch)
-    common = ("-std=c++20", "-O3", "-fPIC", "-D_GLIBCXX_USE_CXX11_ABI=1", "-fopenmp")
+    common = ("-std=c++20", "-O3", "-fPIC", "-fvisibility=hidden", "-fopenmp-simd", "-pthread")
     levels = {"arch_native": ("-march=native", "-mprefer-vector-width=512")}
-    facts: list[object] = ["answer", "2.99.0", common, platform.system(), "x86_64", "native", levels, "a CPU"]
-    facts += [("-fx", "-fy"), ()]
-    for any_gpu in (False, True):
-        files = [package.folder / name for name in ("answer.cpp", "binding.cpp", "level.cpp", "fill.cu")]
-        files += [package.folder / "value.h", *sorted(toolchain.SHARED_INCLUDE.rglob("*.h"))]
-        more = ["13.0", () if any_gpu else ["8.0", "9.0a"], ()]
-        digest = hashlib.sha256(repr(facts + more).encode())
-        for path in files:
-            content = path.read_bytes()
-            digest.update(f"\0{path.name}\0{len(content)}\0".encode() + content)
-        assert module.key("native", any_gpu=any_gpu) == digest.hexdigest()[:16]
-    for folder, any_gpu in ((module.prebuilt_folder, True), (module.cache_folder, False)):
-        key = module.key("native", any_gpu=any_gpu)
-        assert module._library(folder, "native") == folder / f"answer-{key}.so"
+    facts: list[object] = ["answer", "ABI 1", common, platform.system(), "x86_64", "native", levels, "a CPU"]
+    facts += [("-fx", "-fy"), (), None, ["8.0", "9.0a"], ()]
+    files = [package.folder / name for name in ("answer.cpp", "second.cpp", "level.cpp", "fill.cu", "face.h")]
+    digest = hashlib.sha256(repr(facts).encode())
+    for path in [*files, package.folder / "value.h", *sorted(toolchain.SHARED_INCLUDE.rglob("*.h"))]:
+        content = path.read_bytes()
+        digest.update(f"\0{path.name}\0{len(content)}\0".encode() + content)
+    assert module.key("native") == digest.hexdigest()[:16]
+    assert module._library(module.cache_folder, "native").name == f"answer-{module.key('native')}.so"
+    assert module._library(module.prebuilt_folder, "portable").name == f"answer-portable-{module.source_hash()}.so"

@@ -19,7 +19,7 @@ from splatwizard_native import NativeModule
 from sw_doctor.building import build_all
 {call}
 """
-MODULE = "NativeModule('slow', {package!r}, ('answer.cpp', 'second.cpp')).build()"
+MODULE = "NativeModule('slow', {package!r}, 'face.h', ('answer.cpp', 'second.cpp')).build()"
 ALL = "build_all([{package!r} + '.native:SLOW'])"
 
 
@@ -46,7 +46,7 @@ def test_sigterm_ends_compilers_and_their_children(package, tmp_path, call, jobs
     package.write(
         "native.py",
         "from splatwizard_native import NativeModule\n"
-        f"SLOW = NativeModule('slow', '{package.folder.name}', ('answer.cpp', 'second.cpp'))\n",
+        f"SLOW = NativeModule('slow', '{package.folder.name}', 'face.h', ('answer.cpp', 'second.cpp'))\n",
     )
     notes = tmp_path / "compilers"
     notes.mkdir()

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from native_package import call, needs_compiler
+from native_package import answer_of, call, needs_compiler
 
 from splatwizard_native import NativeBuildError
 
@@ -34,12 +34,12 @@ def test_a_header_that_is_not_declared_is_an_error_that_names_it(package):
 
 @needs_compiler
 def test_a_compile_error_shows_the_compilers_line_the_log_and_how_to_go_on(package):
-    package.write("answer.cpp", 'extern "C" int answer() { return nonsense; }\n')
+    package.write("answer.cpp", answer_of("nonsense"))
     module = package.module()
     with pytest.raises(NativeBuildError) as caught:
         module.load()
     text = str(caught.value)
-    assert "answer.cpp:1:34: error:" in text
+    assert "answer.cpp:2:38: error:" in text
     assert "nonsense" in text
     assert "without them: answers are guessed" in text
     log = Path(text.partition("full log: ")[2].splitlines()[0])
@@ -52,9 +52,9 @@ def test_a_compile_error_shows_the_compilers_line_the_log_and_how_to_go_on(packa
 
 @needs_compiler
 def test_a_library_that_was_compiled_but_does_not_load_says_why(package):
-    package.write("answer.cpp", 'int missing();\nextern "C" int answer() { return missing(); }\n')
+    package.write("answer.cpp", f"int missing();\n{answer_of('missing()')}")
     with pytest.raises(NativeBuildError, match=r"does not load: .*undefined symbol.*missing"):
-        package.module(headers=()).load()
+        package.module().load()
 
 
 @needs_compiler

@@ -23,19 +23,14 @@ def test_a_changed_source_or_header_recompiles(package, name):
     assert package.compilations == 2
 
 
-def test_the_cache_key_names_torch_flags_and_cpu(package, monkeypatch):
-    import torch
-
+def test_the_cache_key_names_flags_and_cpu(package, monkeypatch):
     module = package.module()
     keys = {module.key("native"), module.key("portable"), package.module(cflags=("-DX",)).key("native")}
-    with monkeypatch.context() as patch:
-        patch.setattr(torch, "__version__", "99.0")
-        keys.add(module.key("native"))
     with monkeypatch.context() as patch:
         patch.setattr(toolchain, "cpu_identity", lambda: "another CPU")
         keys.add(module.key("native"))
         assert module.key("portable") in keys
-    assert len(keys) == 5
+    assert len(keys) == 4
     assert module.key("native") in keys
 
 
@@ -145,20 +140,20 @@ def test_load_built_says_why_a_build_does_not_load(package):
 
 def test_a_library_of_another_user_is_compiled_anew(package, monkeypatch, caplog):
     library = package.module().build()
-    (kept,) = (library.parent / "objects").iterdir()
+    kept = list((library.parent / "objects").iterdir())
     assert package.module().build() == library
     assert package.links == 1
     real = os.stat
 
     def stat(path, **kwargs):
         found = real(path, **kwargs)
-        return SimpleNamespace(st_uid=12345) if path in (library, kept) and package.links == 1 else found
+        return SimpleNamespace(st_uid=12345) if path in (library, *kept) and package.links == 1 else found
 
     monkeypatch.setattr(library_module.os, "stat", stat)
     package.module().build()
     assert (package.links, package.compilations) == (2, 2)
     assert f"{library} belongs to another user (12345): it is not loaded, but compiled anew" in caplog.text
-    assert f"{kept} belongs to another user" in caplog.text
+    assert all(f"{each} belongs to another user" in caplog.text for each in kept)
 
 
 def test_what_a_killed_build_left_is_removed_by_the_next(package):

@@ -52,7 +52,7 @@ def test_a_module_is_loaded_on_that_account_and_asked_again_for_nothing(clock: C
         self._session.loaded = self.prebuilt_folder
 
     monkeypatch.setattr(NativeModule, "_load", loads)
-    module = NativeModule("a_module", "splatwizard_native", ("nothing.cpp",))
+    module = NativeModule("a_module", "splatwizard_native", "face.h", ("nothing.cpp",))
     module.load()
     module.load()
     assert loading_time() == 4

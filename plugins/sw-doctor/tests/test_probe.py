@@ -54,7 +54,7 @@ def kernels(tmp_path, monkeypatch) -> NativeModule:
     package.mkdir(parents=True)
     (package / "__init__.py").write_text(
         "from splatwizard_native import NativeModule\n"
-        "MODULE = NativeModule(name='doctored', package='doctored_kernels', sources=('a.cpp',),"
+        "MODULE = NativeModule(name='doctored', package='doctored_kernels', face='a.h', sources=('a.cpp',),"
         " without='it is slow')\n"
     )
     (package / "a.cpp").write_text("int a;\n")

@@ -77,20 +77,8 @@ def architectures_of(library: Path | None) -> list[str]:
     return [] if library is None else _facts(library).get("architectures") or []
 
 
-def load_ops(library: Path) -> str | None:
-    """Load the ops into torch; the reason if that fails."""
-    import torch
-
-    try:
-        torch.ops.load_library(str(library))  # type: ignore[no-untyped-call]
-    except (OSError, RuntimeError) as error:
-        return str(error.__cause__ or error)
-    watch_cores()
-    return None
-
-
 def open_face(library: Path, name: str, source_hash: str, symbols: Iterable[str]) -> ctypes.CDLL:
-    """Open a library with a plain C face. Raises OSError if it is none, or one of other sources."""
+    """Open a library. Raises OSError if it has no plain C face, or is one of other sources."""
     opened = ctypes.CDLL(str(library))
     try:
         abi, told = getattr(opened, f"{name}_abi")(), getattr(opened, f"{name}_hash")

@@ -1,6 +1,6 @@
 """Native modules: C++ and CUDA sources that ship with a package, found prebuilt, cached, or compiled on first use.
 
-A module has a plain C face (docs/native.md), or registers ops with TORCH_LIBRARY.
+A module has a plain C face (docs/native.md): one binary for any torch and any Python.
 Environment: SPLATWIZARD_CACHE (where builds go), SPLATWIZARD_NATIVE=0 (do without native code),
 SPLATWIZARD_BUILD_TIMEOUT (seconds to wait for another process's build), CXX, CUDA_HOME, TORCH_CUDA_ARCH_LIST (compute
 capabilities to build for, as "8.0;9.0"; without it those of the GPUs here), MAX_JOBS.
@@ -11,7 +11,6 @@ from __future__ import annotations
 import ctypes
 import functools
 import hashlib
-import importlib.metadata
 import importlib.util
 import itertools
 import logging
@@ -29,10 +28,10 @@ from typing import Any
 from splatwizard_native import cuda_toolkit, toolchain
 from splatwizard_native.errors import NativeBuildError
 from splatwizard_native.face import ABI, OPERATION
-from splatwizard_native.library import architectures_of, fetch, install, is_intact, keep, load_ops, open_face
+from splatwizard_native.library import architectures_of, fetch, install, is_intact, keep, open_face
 from splatwizard_native.lock import build_lock
 from splatwizard_native.settings import SWITCHED_OFF, build_timeout, cache_root, switched_off
-from splatwizard_native.toolchain import Job, Toolchain, plain_libraries, torch_libraries
+from splatwizard_native.toolchain import Job, Toolchain
 from splatwizard_native.work_clock import loading
 
 log = logging.getLogger(__name__)
@@ -46,7 +45,7 @@ Say = Callable[[str], None]
 class _Session:
     """State of a module in this process, shared by all: a loaded library cannot be unloaded.
 
-    library what was loaded, if it has a plain C face
+    library what was loaded
     cuda    whether its module for GPUs is loaded; None: nobody has asked yet
     """
 
@@ -63,26 +62,25 @@ class NativeModule:
 
     name            of the library's file; what C functions of a face begin with
     package         import package whose folder the paths below are relative to
-    sources         C++ files compiled once: the binding file, or what stands behind the face
-    kernels         C++ files compiled once per instruction set, in `namespace SW_ARCH` (<splatwizard/dispatch.h>);
-                    they see no torch header
+    face            header of its plain C face (<splatwizard/c_face.h>)
+    sources         C++ files compiled once: what stands behind the face
+    kernels         C++ files compiled once per instruction set, in `namespace SW_ARCH` (<splatwizard/dispatch.h>)
     headers         every header that the files above include from the package; globs are allowed
-    face            header of a plain C face (<splatwizard/c_face.h>): one binary for any torch; none: torch ops
-    cuda            the same for tensors on a GPU, as a library of its own: torch ops, or a face too
-    cuda_sources    .cu files: this is a module for GPUs, compiled (with SW_WITH_CUDA defined) only where torch has CUDA
+    cuda            the same for tensors on a GPU, as a library of its own
+    cuda_sources    .cu files: this is a module for GPUs, compiled only where torch has CUDA
     cflags          more flags for sources and kernels
     without         what happens without this module, told to the user when it cannot be built
     """
 
     name: str
     package: str
+    face: str
     sources: tuple[str, ...]
     headers: tuple[str, ...] = ()
     cuda_sources: tuple[str, ...] = ()
     cflags: tuple[str, ...] = ()
     kernels: tuple[str, ...] = ()
     without: str = ""
-    face: str = ""
     cuda: NativeModule | None = None
     _session: _Session = field(default_factory=_Session, init=False, repr=False, compare=False)
 
@@ -147,9 +145,9 @@ class NativeModule:
 
     @property
     def library(self) -> ctypes.CDLL:
-        """Return the library of a module with a face, loaded now if it is not yet. Raises NativeBuildError."""
+        """Return the library, loaded now if it is not yet. Raises NativeBuildError."""
         self.load()
-        assert self._session.library is not None, f"'{self.name}' has no plain C face"
+        assert self._session.library is not None
         return self._session.library
 
     @property
@@ -235,24 +233,19 @@ class NativeModule:
         """Folder of builds for this user."""
         return cache_root() / "native"
 
-    def key(self, march: str, *, any_gpu: bool = False) -> str:
-        """Digest of all that the binary depends on: torch and CUDA if it uses them, the CPU if native, flags, sources.
-
-        any_gpu     leave the GPUs' architectures out: a binary in a package says itself which ones it holds
-        """
-        torch = None if self.face else importlib.import_module("torch")  # a library with a face is built without it
-        # The empty flags at the two ends are those of linker and nvcc: modules had some, and older builds stay valid.
+    def key(self, march: str) -> str:
+        """Digest of all that the binary depends on: flags, sources, the CPU if native, the GPUs if it is for these."""
+        # What is empty belonged to linker, nvcc and torch: modules had some, and older builds stay valid.
         facts: list[object] = [
-            self.name, f"ABI {ABI}" if torch is None else str(torch.__version__), self._common_flags(),
-            platform.system(), platform.machine(), march,
+            self.name, f"ABI {ABI}", toolchain.COMMON_FLAGS, platform.system(), platform.machine(), march,
             toolchain.arch_variants(march), toolchain.cpu_identity() if march == "native" else "", self.cflags, (),
         ]  # fmt: skip
         if self.cuda_sources:
-            facts += [torch and torch.version.cuda, () if any_gpu else cuda_toolkit.architectures(), ()]
+            facts += [None, cuda_toolkit.architectures(), ()]
         return self._digest(facts, self._files())
 
     def source_hash(self) -> str:
-        """Digest of sources and flags, whatever compiles them: a library with a face tells it."""
+        """Digest of sources and flags, whatever compiles them: a library tells it."""
         return self._digest([self.name, ABI, self.cflags], self._files())
 
     def _digest(self, facts: list[object], files: Sequence[Path]) -> str:
@@ -280,14 +273,11 @@ class NativeModule:
 
     def _open(self, library: Path) -> str | None:
         """Load a library; the reason if that fails."""
-        if self.face:
-            symbols = [f"{module}_{op}" for module, op in OPERATION.findall(self.face_header) if module == self.name]
-            try:
-                self._session.library = open_face(library, self.name, self.source_hash(), symbols)
-            except OSError as error:
-                return str(error)
-        elif (problem := load_ops(library)) is not None:
-            return problem
+        symbols = [f"{module}_{op}" for module, op in OPERATION.findall(self.face_header) if module == self.name]
+        try:
+            self._session.library = open_face(library, self.name, self.source_hash(), symbols)
+        except OSError as error:
+            return str(error)
         self._session.loaded = library
         return None
 
@@ -303,18 +293,17 @@ class NativeModule:
 
     def _places(self) -> Iterator[Path]:
         """Places of a library for this machine and these sources, best first."""
-        shipped = cuda_toolkit.distributed() if self.face and self.cuda_sources else []
+        shipped = cuda_toolkit.distributed() if self.cuda_sources else []
         for folder, march in itertools.product((*shipped, self.prebuilt_folder, self.cache_folder), MARCHES):
             yield self._library(folder, march)
 
     def prebuilt_name(self, march: str) -> str:
-        """File name in a wheel of a library with a face: the wheel tells for which machine."""
+        """File name in a wheel, which tells for which machine it is."""
         return f"{self.name}-{march}-{self.source_hash()}.so"
 
     def _library(self, folder: Path, march: str) -> Path:
-        if self.face and folder.name == "prebuilt":
-            return folder / self.prebuilt_name(march)
-        return folder / f"{self.name}-{self.key(march, any_gpu=folder == self.prebuilt_folder)}.so"
+        shipped = folder.name == "prebuilt"
+        return folder / (self.prebuilt_name(march) if shipped else f"{self.name}-{self.key(march)}.so")
 
     def _root(self) -> Path:
         spec = importlib.util.find_spec(self.package)
@@ -335,28 +324,19 @@ class NativeModule:
             raise NativeBuildError(missing)
         toolchain.find_compiler()
 
-    def _common_flags(self) -> tuple[str, ...]:
-        return toolchain.plain_flags() if self.face else toolchain.common_flags()
-
     def _jobs(self, march: str, objects: Path) -> list[Job]:
         root, cuda = self._root(), bool(self.cuda_sources)
         variants = toolchain.arch_variants(march)
-        shared = [*self._common_flags(), *(["-DSW_WITH_CUDA"] if cuda else [])]
-        if "arch_v2" in variants:
-            shared.append("-DSW_PORTABLE_X86")
-        # The binding runs on every machine that the binary is for, so it gets the lowest of the variants.
+        shared = [*toolchain.COMMON_FLAGS, *(["-DSW_PORTABLE_X86"] if "arch_v2" in variants else [])]
+        # What calls the kernels runs on every machine that the binary is for, so it gets the lowest of the variants.
         lowest = next(iter(variants.values()))
         include = toolchain.SHARED_INCLUDE_FLAGS
-        theirs = () if self.face else toolchain.torch_include_flags()
-        theirs += toolchain.cuda_flags("-isystem", "include") if cuda else ()
-        binding = (*shared, *lowest, *include, *theirs, *self.cflags)
-        sources = [root / s for s in self.sources]
-        if self.face:
-            sources.append(objects / f"{self.name}.cpp")
-            sources[-1].write_text(
-                f'#include <splatwizard/c_face.h>\nSW_FACE({self.name}, "{self.source_hash()}")\n', "utf-8"
-            )
-        jobs = [Job(source, objects / f"{i}.o", binding) for i, source in enumerate(sources)]
+        theirs = toolchain.cuda_flags("-isystem", "include") if cuda else ()
+        sources = [*(root / s for s in self.sources), objects / f"{self.name}.cpp"]
+        tells = f'#include <splatwizard/c_face.h>\nSW_FACE({self.name}, "{self.source_hash()}")\n'
+        sources[-1].write_text(tells, "utf-8")
+        behind = (*shared, *lowest, *include, *theirs, *self.cflags)
+        jobs = [Job(source, objects / f"{i}.o", behind) for i, source in enumerate(sources)]
         # Lowest level first: of inline functions that several objects emit the linker keeps the first, and that
         # one must run on every machine.
         for arch, flags in variants.items():
@@ -366,22 +346,22 @@ class NativeModule:
             asked = [a.replace(".", "").partition("+") for a in cuda_toolkit.architectures()]
             code = [(a, kind) for a, ptx, _ in asked for kind in (("sm", "compute") if ptx else ("sm",))]
             gencode = [f"-gencode=arch=compute_{a},code={kind}_{a}" for a, kind in code]
-            flags = ("-std=c++20", "-O3", "-Xcompiler", "-fPIC", "-DSW_WITH_CUDA", *gencode, *include)
+            flags = ("-std=c++20", "-O3", "-Xcompiler", "-fPIC", *gencode, *include)
             jobs += [Job(root / s, objects / f"cuda-{i}.o", flags, cuda=True) for i, s in enumerate(self.cuda_sources)]
         return jobs
 
     def _kept(self, jobs: Sequence[Job], compiler: str) -> list[Path]:
         """Places of objects, by all that they depend on, so that one changed file is compiled alone."""
         headers = [path for path in self._files() if path.suffix == ".h"]
-        folder, torchs = self.cache_folder / "objects", "" if self.face else importlib.metadata.version("torch")
         places = []
         for job in jobs:
-            facts: list[object] = [compiler, torchs, [f for f in job.flags if f != str(toolchain.SHARED_INCLUDE)]]
-            places.append(folder / f"{job.source.stem}-{self._digest(facts, [job.source, *headers])}.o")
+            facts: list[object] = [compiler, "", [f for f in job.flags if f != str(toolchain.SHARED_INCLUDE)]]
+            name = f"{job.source.stem}-{self._digest(facts, [job.source, *headers])}.o"
+            places.append(self.cache_folder / "objects" / name)
         return places
 
     def _compile(self, library: Path, march: str, tools: Toolchain, say: Say, force: bool) -> None:
-        self._find_compilers(for_torch=not self.face or march == "native")
+        self._find_compilers(for_torch=march == "native")
         say(f"compiling kernels '{self.name}' (once) ...")
         started, cuda = time.monotonic(), bool(self.cuda_sources)
         build_log = library.with_suffix(".log")
@@ -398,8 +378,8 @@ class NativeModule:
             try:
                 tools.compile(missing, build_log)
                 self._check_headers(missing)
-                linked = plain_libraries(march, shown, cuda=cuda) if self.face else torch_libraries(cuda=cuda)
-                tools.link([j.output for j in jobs], built, build_log, linked)
+                libraries = toolchain.libraries(march, shown, cuda=cuda)
+                tools.link([j.output for j in jobs], built, build_log, libraries)
             except NativeBuildError as error:
                 raise NativeBuildError(f"\n{error}\nfull log: {build_log}") from error
             for job in missing:

@@ -1,7 +1,7 @@
 """Drives the compilers: finds them, knows the flags, compiles in parallel, and makes their errors readable.
 
 Not torch.utils.cpp_extension: that gives one set of flags to all files of a module, needs ninja and setuptools,
-and waits for ever on the lock of a dead process. What is left to know is the two lists of paths below.
+and waits for ever on the lock of a dead process.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ SHARED_INCLUDE = Path(__file__).parent / "include"
 SHARED_INCLUDE_FLAGS = ("-isystem", str(SHARED_INCLUDE))
 SHOWN_LINES = 10
 COMPILERS = ("g++", "c++", "clang++")
+COMMON_FLAGS = ("-std=c++20", "-O3", "-fPIC", "-fvisibility=hidden", "-fopenmp-simd", "-pthread")
 
 # namespace of the kernels -> flags, for a binary that runs on any x86-64 of the last fifteen years
 X86_LEVELS = {
@@ -79,29 +80,6 @@ def cpu_identity() -> str:
     # Model too: the compiler tunes for it.
     wanted = ("CPU part", "Features", "flags", "model name")
     return repr([(key, " ".join(sorted(told[key].split()))) for key in wanted if key in told])
-
-
-def plain_flags() -> tuple[str, ...]:
-    """C++ flags of a module with a plain C face."""
-    return ("-std=c++20", "-O3", "-fPIC", "-fvisibility=hidden", "-fopenmp-simd", "-pthread")
-
-
-def common_flags() -> tuple[str, ...]:
-    """C++ flags of a module of torch ops."""
-    import torch
-
-    flags = ["-std=c++20", "-O3", "-fPIC", f"-D_GLIBCXX_USE_CXX11_ABI={int(torch._C._GLIBCXX_USE_CXX11_ABI)}"]
-    if sys.platform != "darwin":  # Apple's compiler has no OpenMP; at::parallel_for then runs on one thread.
-        flags.append("-fopenmp")
-    return tuple(flags)
-
-
-def torch_include_flags() -> tuple[str, ...]:
-    """-isystem flags for torch's headers."""
-    import torch
-
-    base = Path(torch.__file__).parent / "include"
-    return "-isystem", str(base), "-isystem", str(base / "torch" / "csrc" / "api" / "include")
 
 
 def cuda_flags(flag: str, folder: str) -> tuple[str, ...]:
@@ -169,18 +147,8 @@ class Toolchain:
         self._compilers.stop()
 
 
-def torch_libraries(*, cuda: bool) -> list[str]:
-    """Return what links a library against torch's, after the C++ runtime of this process."""
-    import torch
-
-    libraries = ["-L", str(Path(torch.__file__).parent / "lib"), "-ltorch", "-ltorch_cpu", "-lc10"]
-    libraries += ["-ltorch_cuda", "-lc10_cuda", *cuda_flags("-L", "lib64"), "-lcudart"] if cuda else []
-    extra = ["-fopenmp"] if sys.platform != "darwin" else ["-undefined", "dynamic_lookup"]
-    return [*runtime_libraries(), *extra, *libraries]
-
-
-def plain_libraries(march: str, shown: Path, *, cuda: bool = False) -> list[str]:
-    """Return what links a library with a plain C face: a portable one brings its C++ runtime, shows a list.
+def libraries(march: str, shown: Path, *, cuda: bool = False) -> list[str]:
+    """Return what links a library: a portable one brings its C++ runtime, and has a list of what it shows.
 
     One for GPUs brings CUDA's runtime, and hides it: it must not mix with that of torch, which may be another one.
     """

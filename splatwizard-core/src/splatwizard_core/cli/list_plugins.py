@@ -57,7 +57,7 @@ def _kernels(entries: Iterable[Entry]) -> dict[str, str]:
     declared = [entry.declared.get("native") or () for entry in entries]
     targets = [target for each in declared for target in ([each] if isinstance(each, str) else each)]
     modules = [pkgutil.resolve_name(target) for target in dict.fromkeys(targets)]
-    return {module.name: module.state()["state"] for module in modules if module.face}  # others need torch
+    return {module.name: module.state()["state"] for module in modules}
 
 
 def _print(found: dict[str, Any], *, verbose: bool) -> None:

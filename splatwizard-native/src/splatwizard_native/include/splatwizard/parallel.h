@@ -4,8 +4,7 @@
 //     parallel(n, 4096, [&](int64_t begin, int64_t end) { for (int64_t i = begin; i < end; ++i) x[i] *= 2; });
 //   }
 //
-// The threads are those of splatwizard_native/pool, as many as torch.get_num_threads() says, or torch's own in a binding
-// file (<splatwizard/torch_parallel.h>). How a range is cut depends on their number, so a kernel whose result must not
+// The threads are those of splatwizard_native/pool, as many as torch.get_num_threads() says. How a range is cut depends on their number, so a kernel whose result must not
 // depend on it computes every element in one order whatever the cut, or reduces per fixed block.
 #pragma once
 #include <atomic>
