@@ -135,20 +135,44 @@ def test_a_face_for_gpus_is_built_without_torch_and_tells_cudas_errors(package, 
         offered.look(x=0, count=1, refused=1, device=0)
 
 
+def test_an_object_of_one_cuda_compiler_or_of_its_flags_is_not_taken_for_that_of_another(
+    package, monkeypatch, tmp_path
+):
+    package.write("face.h", GPU_FACE)
+    package.write("fill.cu", CUDA_KERNEL)
+    module = package.module(cuda_sources=("fill.cu",), face="face.h")
+    monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "9.0")
+    monkeypatch.setattr(cuda_toolkit, "find_nvcc", lambda: "nvcc")
+    jobs = module._jobs("portable", tmp_path)
+
+    def kept(release: tuple[int, int], flags: str) -> list[Path]:
+        monkeypatch.setattr(cuda_toolkit, "nvcc_version", lambda nvcc: release)
+        monkeypatch.setenv("NVCC_APPEND_FLAGS", flags)
+        return module._kept(jobs, "g++ 12")
+
+    for other in (kept((12, 9), "-G"), kept((13, 0), "")):
+        equal = [a == b for a, b in zip(kept((12, 9), ""), other, strict=True)]
+        assert equal == [not job.cuda for job in jobs]
+        assert not all(equal)
+
+
 @needs_compiler
-def test_a_distributed_cuda_library_is_used_without_a_cuda_compiler_if_it_fits_the_gpu(package, monkeypatch, tmp_path):
+@pytest.mark.parametrize(("cuda", "other"), [("12.4", "13.0"), ("13.0", "12.4")])
+def test_a_distributed_cuda_library_is_used_without_a_cuda_compiler_if_it_fits_the_gpu(
+    package, monkeypatch, tmp_path, cuda, other
+):
     """It lies in the distribution for the CUDA of torch; one of another version of the sources has another name."""
     import torch
 
     package.write("face.h", GPU_FACE)
     package.write("fill.cu", CUDA_KERNEL)
     module = package.module(cuda_sources=("fill.cu",), face="face.h")
-    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    monkeypatch.setattr(torch.version, "cuda", cuda)
     monkeypatch.setattr(cuda_toolkit, "find_nvcc", lambda: None)
-    shipped = tmp_path / "shipped" / "splatwizard_cuda13" / "prebuilt"
+    shipped = tmp_path / f"shipped_{cuda[:2]}" / f"splatwizard_cuda{cuda[:2]}" / "prebuilt"
     shipped.mkdir(parents=True)
     (shipped.parent / "__init__.py").write_text("")
-    monkeypatch.syspath_prepend(str(tmp_path / "shipped"))
+    monkeypatch.syspath_prepend(str(shipped.parent.parent))
     library = shipped / module.prebuilt_name("portable")
     library.write_bytes(b"not looked into")
     facts = {"sha256": digest_of(library), "architectures": ["8.0", "9.0", "12.0a", "12.5+PTX"]}
@@ -167,6 +191,9 @@ def test_a_distributed_cuda_library_is_used_without_a_cuda_compiler_if_it_fits_t
         assert (library in module._existing()) == suits
         assert (module.available() is None) == suits
     assert module.state()["state"] == "prebuilt"
+    monkeypatch.setattr(torch.version, "cuda", other)
+    assert not list(module._existing())
+    monkeypatch.setattr(torch.version, "cuda", cuda)
     package.write("fill.cu", CUDA_KERNEL + "// changed\n")
     assert not list(module._existing())
 

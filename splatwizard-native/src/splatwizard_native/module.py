@@ -14,6 +14,7 @@ import hashlib
 import importlib.util
 import itertools
 import logging
+import os
 import platform
 import re
 import shutil
@@ -353,9 +354,11 @@ class NativeModule:
     def _kept(self, jobs: Sequence[Job], compiler: str) -> list[Path]:
         """Places of objects, by all that they depend on, so that one changed file is compiled alone."""
         headers = [path for path in self._files() if path.suffix == ".h"]
+        nvcc = self.cuda_sources and cuda_toolkit.nvcc_version(cuda_toolkit.find_nvcc() or "nvcc")
         places = []
         for job in jobs:
             facts: list[object] = [compiler, "", [f for f in job.flags if f != str(toolchain.SHARED_INCLUDE)]]
+            facts += [nvcc, os.environ.get("NVCC_APPEND_FLAGS")] if job.cuda else []
             name = f"{job.source.stem}-{self._digest(facts, [job.source, *headers])}.o"
             places.append(self.cache_folder / "objects" / name)
         return places
@@ -385,13 +388,8 @@ class NativeModule:
             for job in missing:
                 keep(job.output, kept[job])
             seconds = round(time.monotonic() - started, 1)
-            facts = {
-                "seconds": seconds,
-                "compiler": tools.version(),
-                "march": march,
-                "architectures": cuda_toolkit.architectures() if cuda else [],
-            }
-            install(built, library, facts)
+            facts = {"seconds": seconds, "compiler": tools.version(), "march": march}
+            install(built, library, {**facts, "architectures": cuda_toolkit.architectures() if cuda else []})
         say(f"compiled kernels '{self.name}' in {seconds:.0f} s")
 
     def _check_headers(self, jobs: list[Job]) -> None:
