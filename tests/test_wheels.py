@@ -94,3 +94,14 @@ def test_only_gpus_that_a_compiler_knows_are_asked_for(tmp_path):
     nvcc.write_text("#!/bin/sh\necho compute_75 compute_80 compute_86 compute_89 compute_90 compute_90a\n")
     nvcc.chmod(0o755)
     assert build_cuda_wheel.offered(str(nvcc)) == ["7.5", "8.0", "8.6", "8.9", "9.0+PTX"]
+
+
+@pytest.mark.parametrize(
+    ("told", "flags"),
+    [("--compress-mode {default|size|speed|balance|none}", "--compress-mode=size"), ("", "-Xfatbin -compress-all")],
+)
+def test_a_cuda_compiler_makes_the_smallest_libraries_that_it_can(tmp_path, told, flags):
+    nvcc = tmp_path / "nvcc"
+    nvcc.write_text(f"#!/bin/sh\necho '{told}'\n")
+    nvcc.chmod(0o755)
+    assert build_cuda_wheel.compression(str(nvcc)) == flags

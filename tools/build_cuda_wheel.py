@@ -48,6 +48,12 @@ def offered(nvcc: str) -> list[str]:
     return [*found[:-1], f"{found[-1]}+PTX"]
 
 
+def compression(nvcc: str) -> str:
+    """Return the flags by which a compiler makes its smallest libraries; since CUDA 12.8 it has a mode for that."""
+    told = subprocess.run([nvcc, "--help"], capture_output=True, text=True, check=True).stdout
+    return "--compress-mode=size" if "--compress-mode" in told else "-Xfatbin -compress-all"
+
+
 def version_of(package: Path) -> str:
     """The version that a package's pyproject.toml tells."""
     found = re.search(r'^version = "(.+)"$', (package / "pyproject.toml").read_text("utf-8"), re.MULTILINE)
@@ -100,8 +106,7 @@ def main() -> None:
     if nvcc is None or version is None:
         sys.exit("there is no nvcc that runs: point CUDA_HOME at a CUDA toolkit")
     os.environ.setdefault("TORCH_CUDA_ARCH_LIST", ";".join(offered(nvcc)))
-    if "--compress-mode" in subprocess.run([nvcc, "--help"], capture_output=True, text=True, check=True).stdout:
-        os.environ.setdefault("NVCC_APPEND_FLAGS", "--compress-mode=size")
+    os.environ.setdefault("NVCC_APPEND_FLAGS", compression(nvcc))
     machine, found = platform.machine(), list(modules())
     versions = {package.name: version_of(package) for package, _ in found}
     with tempfile.TemporaryDirectory() as scratch:
