@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 import time
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -19,6 +21,7 @@ RUN = (
     "run", "--method", "chimerags", "--scene", "demo", "--preset", "quick", "--set", "iterations=300",
     "--set", "train.stop=100", "--set", "distill.iterations=60",
 )  # fmt: skip
+OF_GLIBC = {"libc.so.6", "libm.so.6", "libpthread.so.0", "libdl.so.2", "librt.so.1", "ld-linux-x86-64.so.2"}
 MOST_MORE = 30.0
 """Seconds that install and first run may take beyond a second run."""
 
@@ -70,6 +73,24 @@ def test_a_wheel_has_the_same_bytes_wherever_it_is_built(wheels, tmp_path):
     (again,) = (tmp_path / "again").iterdir()
     (before,) = (wheel for wheel in wheels if wheel.name == again.name)
     assert again.read_bytes() == before.read_bytes()
+
+
+def test_no_library_asks_for_more_of_the_system_than_the_wheel_tells(wheels, tmp_path):
+    """Of glibc nothing newer than the platform in the wheel's name, and of other libraries none but glibc's own."""
+    found = 0
+    for wheel in wheels:
+        with zipfile.ZipFile(wheel) as content:
+            content.extractall(tmp_path / wheel.stem)
+        for library in (tmp_path / wheel.stem).rglob("*.so"):
+            told = subprocess.run(["objdump", "-p", library], capture_output=True, text=True, check=True).stdout
+            newest = int(re.search(r"manylinux_2_(\d+)_", wheel.name)[1])
+            asked = [version[1] for version in re.finditer(r"^ +0x\w+ 0x\w+ \d+ (\S+)$", told, re.MULTILINE)]
+            assert asked
+            assert all(re.fullmatch(r"GLIBC_2\.[\d.]+", version) for version in asked)
+            assert max(int(version.split(".")[1]) for version in asked) <= newest
+            assert set(re.findall(r"NEEDED +(\S+)", told)) <= OF_GLIBC
+            found += 1
+    assert found >= 9
 
 
 def test_doctor_and_list_say_of_each_module_that_it_is_prebuilt(wheels, environment, tmp_path):
