@@ -61,8 +61,7 @@ class AnchorStage(Stage):
         super().__init__(opt)
         opt.pictures.check(opt, pictures)
         self.pictures, self._whole = pictures, WholeAnchorStep()
-        self.extent = 1.0  # known when the stage begins; a plan can be printed without a scene
-        self.early = opt.lr.mlp_opacity_early or 1.0
+        self.extent, self.early = 1.0, opt.lr.mlp_opacity_early or 1.0  # of the scene, once the stage begins
 
     def at(self, step: int) -> int:
         """Scale a step, or a step count, of the full schedule to this run, as `when` does."""
@@ -76,8 +75,8 @@ class AnchorStage(Stage):
             raise TypeError(f"stage '{self.name}' trains a {self.trains.__name__}, not a {type(model).__name__}")
         self.growth_draws = context.generator("growth")
         self.extent, points = context.scene.extent, context.scene.points
-        if self.opt.lr.mlp_opacity_early is None and points is not None and len(points.xyz) < 50_000:
-            self.early = 0.3  # at 1 none of chair's 10,000 was left
+        if points is not None and len(points.xyz) < 50_000:  # at 1 none of the anchors of chair's 10,000 was left
+            self.early = self.opt.lr.mlp_opacity_early or 0.3
         if self.opt.visible_offsets:
             model.show_offsets(self.opt.visible_offsets, torch.stack([v.camera.center for v in context.scene.train]))
         return model
