@@ -133,7 +133,7 @@ def test_the_command_lines_of_a_build(package, monkeypatch, tmp_path, march):
     cuda = f"-L {home}/lib64 -lcudart_static -ldl -lrt"
     shows = f"-Wl,--version-script={scratch}/shown"
     runtime = "".join(f"{path} " for path in toolchain.runtime_libraries())
-    portable = f"-pthread {cuda} -static-libstdc++ -static-libgcc {shows} -Wl,-s"
+    portable = f"-pthread {cuda} -static-libstdc++ -static-libgcc {shows} -Wl,-s,-z,defs"
     linked = f"{runtime}-pthread {cuda} {shows}" if march == "native" else portable
     assert shlex.join(link) == f"g++ -v1 -shared {objects} -o {scratch}/{library.name} {linked}"
     facts = json.loads(library.with_suffix(".json").read_text())

@@ -3,12 +3,13 @@
 import ctypes
 import json
 import subprocess
+import sys
 
 import pytest
 import torch
 from native_package import digest_of, needs_compiler
 
-from splatwizard_native import find_compiler
+from splatwizard_native import NativeBuildError, find_compiler
 from splatwizard_native.face import Field, read_structs
 from splatwizard_native.face_operations import operations
 
@@ -236,6 +237,14 @@ def test_a_key_depends_on_no_torch(module, monkeypatch):
     assert module.key("native") == key
     log = module.build().with_suffix(".log").read_text()
     assert not any(torchs in log for torchs in ("/torch/", "-ltorch", "-lc10"))
+
+
+@needs_compiler
+@pytest.mark.skipif(sys.platform != "linux", reason="linkers of other systems do so anyway")
+def test_a_library_for_others_that_lacks_a_symbol_is_not_built(module, package, tmp_path):
+    package.write("answer.cpp", SOURCE + 'extern "C" int nowhere();\nint somewhere() { return nowhere(); }\n')
+    with pytest.raises(NativeBuildError, match="nowhere"):
+        module.build(march="portable", folder=tmp_path)
 
 
 @needs_compiler

@@ -155,7 +155,7 @@ def libraries(march: str, shown: Path, *, cuda: bool = False) -> list[str]:
     runtime = [*cuda_flags("-L", "lib64"), "-lcudart_static", "-ldl", "-lrt"] if cuda else []
     shows = f"-Wl,--version-script={shown}"
     if march != "native" and sys.platform == "linux":
-        return ["-pthread", *runtime, "-static-libstdc++", "-static-libgcc", shows, "-Wl,-s"]
+        return ["-pthread", *runtime, "-static-libstdc++", "-static-libgcc", shows, "-Wl,-s,-z,defs"]
     return [*runtime_libraries(), "-pthread", *runtime, *([shows] if cuda else [])]
 
 
