@@ -69,6 +69,9 @@ class LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
+        for option, number, unit in zip(args, args[1:], args[2:], strict=False):
+            if option in ("--size", "--bytes") and number[-1:].isdigit() and unit.lower() in ("kb", "mb", "gb", "mib"):
+                raise click.UsageError(f"{option} {number} {unit} has a blank in it: write {number}{unit}", ctx)
         try:
             return super().resolve_command(ctx, args)
         except click.UsageError as error:
