@@ -87,6 +87,8 @@ class Reduction:
         if len(rows) > count and power < 1:
             # Of some that merged so little is left that nothing is drawn.
             merged, weights = merged_by(self.model, rows, count, self.weights()[rows], faintest=FAINTEST)
+            if merged.sh_rest.untyped_storage().nbytes() > merged.sh_rest.nbytes:  # memory of all that merged
+                merged.sh_rest.data = merged.sh_rest.clone()
             found = like(self.model, merged)
         else:
             found, weights = select(self.model, rows), self.pruning.importance[rows]

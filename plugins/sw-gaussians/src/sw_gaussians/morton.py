@@ -33,6 +33,10 @@ def morton_order(points: Tensor) -> Tensor:
 
 def interleave(cells: Any) -> Any:
     """Return the codes [N] of int64 cells [N,3], 0 <= cell < 2^21: an array for an array, a tensor for a tensor."""
-    for shift, mask in _SPREAD:
-        cells = (cells | (cells << shift)) & mask
-    return cells[:, 0] | (cells[:, 1] << 1) | (cells[:, 2] << 2)
+    found = cells[:, 0] | 0  # of its kind, and where it is
+    for start in range(0, len(cells), ROWS_AT_ONCE):
+        part = cells[start : start + ROWS_AT_ONCE]
+        for shift, mask in _SPREAD:
+            part = (part | (part << shift)) & mask
+        found[start : start + ROWS_AT_ONCE] = part[:, 0] | (part[:, 1] << 1) | (part[:, 2] << 2)
+    return found

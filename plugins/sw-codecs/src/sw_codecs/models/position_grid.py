@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 MAX_TOP = 40
 CORE_SHARE = 0.75
 """Share of the Gaussians, per axis, that lies in the linear part."""
+ROWS_AT_ONCE = 1 << 14
+"""Points whose cells are found together: doubles of all would outweigh their cells several times."""
 
 
 @dataclass(frozen=True)
@@ -32,12 +34,16 @@ class PositionGrid:
     @classmethod
     def fit(cls, points: NDArray[Any], bits: int) -> PositionGrid:
         """The grid for these points [N,3], finite."""
-        points = np.asarray(points, dtype=np.float64)
         if len(points) == 0:
             return cls((0.0,) * 3, (1.0,) * 3, (1,) * 3, bits)
-        center = np.median(points, axis=0)
-        away = np.abs(points - center)
-        return cls.around(center, np.quantile(away, CORE_SHARE, axis=0), away.max(axis=0), bits)
+        facts = []
+        for axis in range(3):  # doubles of one at a time
+            along = np.array(points[:, axis], dtype=np.float64)
+            center = np.median(along)
+            along -= center
+            away = np.abs(along, out=along)
+            facts.append((center, np.quantile(away, CORE_SHARE), away.max()))
+        return cls.around(*np.array(facts).T, bits)
 
     @classmethod
     def around(
@@ -52,11 +58,15 @@ class PositionGrid:
 
     def quantize(self, points: NDArray[Any]) -> NDArray[np.int64]:
         """Cells [N,3] int64 in 0 .. 2^bits - 1 of points [N,3]."""
-        u = (np.asarray(points, dtype=np.float64) - self.center) / self.width
-        v = np.copysign(_compress(np.abs(u)), u)
         top = np.asarray(self.top, dtype=np.float64)
-        cells = np.floor((v + top) / (2 * top) * 2.0**self.bits).astype(np.int64)
-        return np.clip(cells, 0, 2**self.bits - 1)
+        found = np.empty((len(points), 3), np.int64)
+        for start in range(0, len(points), ROWS_AT_ONCE):
+            part = slice(start, start + ROWS_AT_ONCE)
+            u = (np.asarray(points[part], dtype=np.float64) - self.center) / self.width
+            v = np.copysign(_compress(np.abs(u)), u)
+            cells = np.floor((v + top) / (2 * top) * 2.0**self.bits).astype(np.int64)
+            np.clip(cells, 0, 2**self.bits - 1, out=found[part])
+        return found
 
     def dequantize(self, cells: NDArray[Any]) -> NDArray[np.float32]:
         """Cell centres [N,3] float32."""

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError
+from sw_gaussians import heap
 from sw_gaussians.surfels import SurfelModel, gaussians_of
 
 from splatwizard_core.api import BitstreamError, GaussianModel, Params
@@ -181,6 +182,7 @@ def encode_rows(
     """Write the sections of rows of the lattice, which lie in the order of their positions."""
     writer.add(f"{prefix}positions", positions.encode(found.cells, found.layout.position_bits))
     for name, part in _parts(found):
+        heap.trim()
         if isinstance(part, list):
             writer.add(f"{prefix}{name}", encode_band(columns, part))
         else:
@@ -327,9 +329,11 @@ def unrounded(model: GaussianModel, precision_power: float, own_basis: bool) -> 
     arrays = {name: getattr(model, name).detach().cpu().numpy() for name in model.RAW}
     keep = arrays["opacity_logits"] >= FAINTEST
     for array in arrays.values():
-        # +inf is a legitimate logit (opacity 1); everything else must be finite to be drawn.
-        finite = ~np.isnan(array) if array is arrays["opacity_logits"] else np.isfinite(array)
-        keep &= finite.all(axis=tuple(range(1, finite.ndim)))
+        for start in range(0, len(keep), ROWS_AT_ONCE):
+            part = array[start : start + ROWS_AT_ONCE]
+            # +inf is a legitimate logit (opacity 1); everything else must be finite to be drawn.
+            finite = ~np.isnan(part) if array is arrays["opacity_logits"] else np.isfinite(part)
+            keep[start : start + ROWS_AT_ONCE] &= finite.all(axis=tuple(range(1, finite.ndim)))
     if not keep.all():
         log.info("%d of %d Gaussians can never be drawn and are left out", int((~keep).sum()), len(keep))
         arrays = {name: array[keep] for name, array in arrays.items()}
@@ -388,11 +392,14 @@ def rounded(
         precision=None if given.classes is None else True,
         primitive=given.primitive,
     )
+    cells = cells[order]
+    heap.trim()
     symbols, basis = quantize(given.values, layout.steps, order)
     if basis is not None:
         layout = layout.model_copy(update={"sh_basis": True})
     classes = None if given.classes is None else given.classes[order]
-    return Lattice(layout, cells[order], symbols, basis, classes)
+    heap.trim()
+    return Lattice(layout, cells, symbols, basis, classes)
 
 
 def lattice(
