@@ -15,6 +15,7 @@ from sw_compress.ply_blocks import blocks_of
 from sw_compress.shelf import Shelf
 from sw_compress.source import FAINTEST
 from sw_compress.stages import Stages
+from sw_compress.whole import Whole
 from sw_gaussians.rows import select
 
 from splatwizard_core.api import Camera, GaussianModel, RasterOptions, UserInputError
@@ -214,10 +215,21 @@ def test_a_sample_is_of_runs_from_everywhere():
     assert torch.equal(sample_rows(50, 100, 10), torch.arange(50))
 
 
+class Removals:
+    """Removals of which none is asked for."""
+
+    def __init__(self, importance: torch.Tensor) -> None:
+        self.importance, self.unseen, self.keeps_unseen = importance, torch.zeros_like(importance) > 0, True
+
+    def rows(self, count: int) -> torch.Tensor:
+        return torch.arange(len(self.importance))
+
+
 def test_tiles_have_as_many_as_if_the_whole_merged_at_once(scene):
-    light = scene.light
-    weights = torch.where(torch.arange(light.num_rows) < scene.limits[1], 1.0, 1e-4)  # the first tile matters
-    counts = large.count_by_tile(scene, torch.arange(light.num_rows), 1_000, weights)
+    count = scene.num_rows
+    weights = torch.where(torch.arange(count) < scene.limits[1], 1.0, 1e-4)  # the first tile matters
+    whole = Whole(scene, Removals(weights), [CAMERA], NegotiatedRasterizer(load_plugins(), device=CPU))
+    counts = whole.counts(1_000, 0.5)
     assert sum(counts) <= 1_000
     assert counts[0] > 0.8 * scene.limits[1]
-    assert counts[1] < 0.5 * (light.num_rows - scene.limits[1])
+    assert counts[1] < 0.5 * (count - scene.limits[1])

@@ -28,19 +28,20 @@ from sw_compress.allocation import of_error
 from sw_compress.among import Among, coarse, sample_rows, without
 from sw_compress.coders import FIXED_BYTES, Quantized
 from sw_compress.filling import AIM, MOST_ENCODES
-from sw_compress.large_scene import Curve, LargeScene, read_scene
+from sw_compress.large_scene import LargeScene, read_scene
 from sw_compress.measuring import Errors
 from sw_compress.ply_blocks import PlyBlocks, blocks_of
 from sw_compress.pruning import Pruning
 from sw_compress.quality import Pictures, decibels
 from sw_compress.reducing import Reduction
 from sw_compress.rows import IMPORTANCE, like, select, with_degree
-from sw_compress.search import Choice, Search, for_quality, for_size, least_bytes, too_small
+from sw_compress.search import Choice, Search, for_quality, for_size, least_bytes, too_small, within_bytes
 from sw_compress.shelf import Shelf
 from sw_compress.stages import Stages, give_back
 from sw_compress.targets import LEAST_SHARE, QUALITY_MARGIN, Target
 from sw_compress.tiled_file import TiledFile, tiles_of
 from sw_compress.views import Views, made_up_views
+from sw_compress.whole import Whole
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -55,6 +56,10 @@ SAMPLE, RUN = 1 << 18, 1 << 12
 """Gaussians that are searched with, and how many of them lie side by side."""
 QUALITY_TRIES = 6
 """Files that are written for a quality; each is decoded and drawn."""
+MOST_BY_REST = 4.0
+"""Times that an error may be larger with higher SH than without."""
+MOST_LOST = 0.6
+"""Share of the error of a quality that may be of Gaussians that are gone."""
 
 
 def large_file(path: Path, device: torch.device) -> PlyBlocks | None:
@@ -147,6 +152,8 @@ class _Sample:
             errors = Errors(coder, model, self.judge)
         self.reduction = Reduction(model, pruning, self.judge)
         self.search = Search(coder, model, self.reduction, self.judge, errors, count)
+        self._plain = Pictures(with_degree(model, 0), seen.judge, among, options)
+        self.whole: dict[int, float] = {}  # Gaussians of the sample -> error of all pictures of the whole
 
     def bytes_of(self, size: float) -> float:
         """The sample's part of a file of `size` bytes: what is fixed has each of them."""
@@ -156,11 +163,35 @@ class _Sample:
         """The file whose part has `size` bytes."""
         return FIXED_BYTES + (size - FIXED_BYTES) / self.share
 
+    def more(self, choice: Choice) -> int | None:
+        """The next larger number to try; None: there is none."""
+        parts = self.search.parts()
+        place = min(range(len(parts)), key=lambda i: abs(parts[i] - choice.model.num_rows))
+        return parts[place - 1] if place else None
+
+    @torch.no_grad()
+    def foreseen(self, choice: Choice, lost: float) -> float:
+        """Error of the pictures of the whole.
+
+        lost    by fewer Gaussians, drawn without higher SH
+
+        Errors of rounding are the sample's, as many times larger: they have no common sign.
+        """
+        part, coder = choice.model, self.search.coder
+        reduced, plain = self.judge.error(part), self._plain.error(with_degree(part, 0))
+        both = self.judge.error(coder.rounded(part, choice.allocation.levels))
+        coder.forget()
+        rest = min(max(reduced / plain, 1.0), MOST_BY_REST) if plain > 0 else 1.0
+        found = rest * lost + max(both - reduced, 0.0) / self.share
+        self.whole[part.num_rows] = found
+        return found
+
     def tried(self) -> list[dict[str, Any]]:
-        """Numbers that were looked at, as figures of the whole."""
+        """Numbers that were looked at, as figures of the whole; the dB of those that it was not drawn for are the
+        sample's, which does not see all."""
         return [
             {"gaussians": round(n / self.share), "bytes": round(self.whole_bytes(b)),
-             "psnr": round(q + 10 * math.log10(self.share), 2)}
+             "psnr": round(decibels(self.whole[n]) if n in self.whole else q + 10 * math.log10(self.share), 2)}
             for n, b, q in self.search.tried
         ]  # fmt: skip
 
@@ -195,10 +226,10 @@ class _Work:
             self.seen = made_up_views(light, rasterizer, asked.views) if asked.given is None else asked.given
             self.held_out = Pictures(scene, self.seen.held_out, rasterizer, RasterOptions(alpha=True))
         self.sample = _Sample(scene, self.seen, rasterizer, self.coder, asked)
-        self._scene: LargeScene | None = scene
         with asked.stages.timed("score"):
-            self._pruning = Pruning(light, self.seen.fit, rasterizer, keeps_unseen=keeps_unseen(asked))
-            unseen = int(self._pruning.unseen.sum())
+            pruning = Pruning(light, self.seen.fit, rasterizer, keeps_unseen=keeps_unseen(asked))
+            unseen = int(pruning.unseen.sum())
+            self._whole: Whole | None = Whole(scene, pruning, self.seen.judge, rasterizer)
         self.facts: dict[str, Any] = {
             "source": {"file": blocks.path.name, "bytes": blocks.path.stat().st_size, "gaussians": read},
             "target": {"bytes": asked.target.size, "psnr": asked.target.quality},
@@ -216,7 +247,8 @@ class _Work:
         size, sample = self.asked.target.size, self.sample
         assert size is not None  # it is asked for
         with self.asked.stages.timed("search"):
-            choice = for_size(sample.search, sample.bytes_of(size)) or sample.search.coarsest
+            choice = for_size(sample.search, sample.bytes_of(size))
+        choice = sample.search.coarsest if choice is None else self._enough(choice, sample.bytes_of(size))
         assert choice is not None  # a search looks at one part at least
         file = self._reduced(choice)
         best, most, held = choice, 0, None
@@ -255,6 +287,7 @@ class _Work:
         with self.asked.stages.timed("search"):
             exact: Any = _Unrounded(sample.judge)
             choice = for_quality(sample.search, quality - 10 * math.log10(sample.share), exact)
+        choice = self._good(choice, 10 ** (-quality / 10))
         file = self._reduced(choice)
         best: tuple[int, Choice] | None = None
         good: tuple[float, float] | None = None  # decibels by the tables, and in pictures
@@ -302,26 +335,57 @@ class _Work:
         with self.asked.stages.timed("encode"):
             return file.write(choice.allocation.levels, self.path)
 
-    def _reduced(self, choice: Choice) -> TiledFile:
-        """The whole scene with as small a share of its Gaussians as a choice has of the sample's; lets the scene go."""
-        scene, self._scene = self._scene, None
-        assert scene is not None  # it is done once
-        whole, searched = scene.num_rows, self.sample.search.model.num_rows
-        count = max(1, round(whole * choice.model.num_rows / searched))
+    def _lost(self, choice: Choice) -> float:
+        """Error of the whole with as small a share of its Gaussians as a choice has of the sample's."""
+        assert self._whole is not None  # not reduced yet
+        with self.asked.stages.timed("score"):
+            return self._whole.lost(*self._share_of(choice))
+
+    def _share_of(self, choice: Choice) -> tuple[int, float]:
+        """Number of Gaussians of the whole, and the power of removals among those that go."""
+        assert self._whole is not None  # not reduced yet
+        whole, rows = self._whole.scene.num_rows, choice.model.num_rows
+        count = max(1, round(whole * rows / self.sample.search.model.num_rows))
         if self.asked.gaussians is not None:
             count = min(self.asked.gaussians, whole)
-        power = self.sample.reduction.power(choice.model.num_rows)
-        reduction = Reduction(scene.light, self._pruning)
-        with self.asked.stages.timed("score"):
-            rows = self._pruning.rows(reduction.kept(count, power) if count < whole else whole)
+        return count, self.sample.reduction.power(rows)
+
+    def _enough(self, choice: Choice, budget: float) -> Choice:
+        """The choice, or one of more Gaussians for the same bytes while that is better for the whole."""
+        sample = self.sample
+        error = sample.foreseen(choice, self._lost(choice))
+        while (count := sample.more(choice)) is not None:
+            with self.asked.stages.timed("search"):
+                other = within_bytes(sample.search, count, budget)
+            if other is None or (found := sample.foreseen(other, self._lost(other))) >= error:
+                break
+            choice, error = other, found
+        self.facts["foreseen"] = round(decibels(error), 2)
+        return choice
+
+    def _good(self, choice: Choice, error: float) -> Choice:
+        """The choice, or one of so many Gaussians that what is gone leaves enough of an error to rounding."""
+        sample = self.sample
+        while (lost := self._lost(choice)) > MOST_LOST * error and (count := sample.more(choice)) is not None:
+            with self.asked.stages.timed("search"):
+                part, curves = sample.search.part(count)
+            choice = Choice(part, curves, choice.allocation)
+        finest = of_error(choice.curves, max(error - lost, (1 - MOST_LOST) * error) * sample.share)
+        return choice if finest.error > choice.allocation.error else replace(choice, allocation=finest)
+
+    def _reduced(self, choice: Choice) -> TiledFile:
+        """The whole scene with as small a share of its Gaussians as a choice has of the sample's; lets the scene go."""
+        count, power = self._share_of(choice)
+        whole, self._whole = self._whole, None
+        assert whole is not None  # it is done once
+        scene, rows = whole.scene, whole.rows(count, power)
         with self.asked.stages.timed("reduce"):
             importance = list[Tensor]()
-            counts = count_by_tile(scene, rows, count if power < 1 else len(rows), reduction.weights())
-            tiles = _reduced(scene, rows, counts, reduction, importance, self.asked)
+            tiles = _reduced(whole, rows, whole.counts(count, power), importance, self.asked)
             found = LargeScene.of_tiles(tiles, self._shelf())
-            self.facts |= {"pruned": whole - len(rows), "merged": len(rows) - found.num_rows}
+            self.facts |= {"pruned": scene.num_rows - len(rows), "merged": len(rows) - found.num_rows}
             scene.shelf.close()
-            del scene, self._pruning, reduction
+            del scene, whole, tiles
             return TiledFile(found, torch.cat(importance), self.coder, coders.OWN_BASIS)
 
 
@@ -330,20 +394,11 @@ def keeps_unseen(asked: Asked) -> bool:
     return not asked.drop_unseen and asked.given is None and asked.gaussians is None
 
 
-def count_by_tile(scene: LargeScene, rows: Tensor, count: int, weights: Tensor) -> list[int]:
-    """Gaussians of each tile, at most, after neighbours have merged: as many as if the whole merged at once."""
-    if count >= len(rows):
-        return [scene.num_rows for _ in scene.tiles]
-    curve = Curve(scene.light.means.detach(), scene.limits[:-1])
-    merged = merged_by(scene.light, rows, count, weights[rows])[0].means.detach()
-    return torch.bincount(curve.parts(merged), minlength=len(scene.tiles)).tolist()
-
-
 def _reduced(
-    scene: LargeScene, rows: Tensor, counts: list[int], reduction: Reduction, importance: list[Tensor], asked: Asked
+    whole: Whole, rows: Tensor, counts: list[int], importance: list[Tensor], asked: Asked
 ) -> Iterator[GaussianModel]:
     """Tiles of the rows that stay, in which neighbours merge until `counts` are left; fills `importance`."""
-    weights, known = reduction.weights(), reduction.pruning.importance
+    scene, weights, known = whole.scene, whole.weights, whole.importance
     with track("reduce", total=len(scene.tiles), unit="tiles") as bar:
         for tile in scene.tiles:
             part = scene.rows(tile)
@@ -354,8 +409,8 @@ def _reduced(
             model = model if asked.sh_degree is None else with_degree(model, asked.sh_degree)
             count, of = max(1, counts[tile]), known[own]
             if count < len(own):
-                whole = torch.arange(len(own), device=own.device)
-                merged, of = merged_by(model, whole, count, weights[own])
+                all_of = torch.arange(len(own), device=own.device)
+                merged, of = merged_by(model, all_of, count, weights[own])
                 model = like(model, merged)
                 drawn = model.opacity_logits >= FAINTEST
                 if not bool(drawn.all()):

@@ -162,6 +162,13 @@ def for_size(search: Search, budget: float) -> Choice | None:
     return Choice(search.gaussians(count) if held is None else held, curves, allocation)
 
 
+def within_bytes(search: Search, count: int, budget: float) -> Choice | None:
+    """The best picture of so many Gaussians in an estimated `budget` bytes; None where they take more."""
+    part, curves = search.part(count)
+    found = within(curves, budget - FIXED_BYTES)
+    return None if found is None else Choice(part, curves, found)
+
+
 def _looked_at(search: Search, count: int, budget: float) -> tuple[Choice | None, float, bool]:
     """The best that so many Gaussians give, its error, and whether no fewer may stay.
 
