@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import json
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,10 +13,12 @@ from sw_compress import Compressed, compress, large, large_scene, ply_blocks, se
 from sw_compress.among import Among, coarse, sample_rows, without
 from sw_compress.large_scene import LargeScene, read_scene
 from sw_compress.ply_blocks import blocks_of
+from sw_compress.quality import Pictures, decibels
 from sw_compress.shelf import Shelf
 from sw_compress.source import FAINTEST
 from sw_compress.stages import Stages
 from sw_compress.whole import Whole
+from sw_gaussians.camera_files import read_cameras
 from sw_gaussians.rows import select
 
 from splatwizard_core.api import Camera, GaussianModel, RasterOptions, UserInputError
@@ -92,6 +95,20 @@ def test_the_picture_is_nearly_that_of_one_pass(source, small):
     assert small.record["quality"]["psnr"] > other.record["quality"]["psnr"] - 2
     assert small.record["cameras"] == other.record["cameras"]
     assert "tiles" not in other.record
+
+
+def test_what_is_foreseen_is_found(tmp_path, ball, monkeypatch):
+    """A sample alone foresees too much: what goes takes light away, and along a ray that adds up."""
+    monkeypatch.setattr(large, "SAMPLE", 1_000)
+    monkeypatch.setattr(search, "SHARES", (0.4,))
+    source = tmp_path / "ball.ply"
+    export_model(ball(4_000, degree=1), source, load_plugins())
+    done = compress(source, size=33_000, views=6, device="cpu")
+    (tmp_path / "judge.json").write_text(json.dumps(done.record["cameras"]["judge"]))
+    cameras = read_cameras(tmp_path / "judge.json").cameras
+    rasterizer = NegotiatedRasterizer(load_plugins(), device=CPU)
+    known = Pictures(read_gaussians(source, load_plugins()), cameras, rasterizer, RasterOptions(alpha=True))
+    assert done.record["foreseen"] == pytest.approx(decibels(known.error(done.model)), abs=0.5)
 
 
 def test_equal_calls_give_equal_bytes(source, small):
