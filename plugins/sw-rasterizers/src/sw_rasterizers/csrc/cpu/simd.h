@@ -66,6 +66,8 @@ SW_HD bool any(PackI mask) {
   return __builtin_ia32_movmskps256((PackF)mask) != 0;  // one instruction
 #elif defined(__x86_64__) && SW_LANES == 4
   return __builtin_ia32_movmskps((PackF)mask) != 0;
+#elif defined(__AVX512F__) && SW_LANES == 16 && !defined(__clang__)
+  return __builtin_ia32_ptestmd512(mask, mask, -1) != 0;  // two; clang finds them in what follows
 #else
   typedef int64_t Wide __attribute__((vector_size(4 * SW_LANES)));
   const Wide pairs = (Wide)mask;
