@@ -35,7 +35,7 @@ class AnchorLearningRates(Params):
     mlp_opacity_final: float = Field(2e-5, gt=0, description="of the opacity network at `max_steps`")
     mlp_opacity_early: float | None = Field(
         1.0, gt=0, le=1,
-        description="factor on the opacity network's rate up to `early_until`; None: 1, or 0.3 of fewer than 50,000 points",
+        description="factor on the opacity network's rate up to `early_until`; None: 1, or 0.3 below 50,000 points",
     )  # fmt: skip
     early_until: int = Field(1_500, ge=0, description="last step that `mlp_opacity_early` applies to")
     mlp_cov_init: float = Field(0.004, gt=0, description="of the covariance network at step 0")
