@@ -15,8 +15,7 @@ from torch import Tensor
 
 BITS = 16
 TOP = (1 << BITS) - 1
-FLAT_AXIS_STEP = 1e-6
-"""Lattice step of an axis without extent, world units."""
+FLAT_AXIS_STEP = 1e-6  # of an axis without extent, world units
 
 Margin = Literal["origin", "extent", "none"]
 """Margin of the lattice bounds around the anchors, see `bounds_of`."""

@@ -10,8 +10,7 @@ from collections.abc import Callable
 
 from torch import Tensor
 
-MAX_EXACT_NUMBERS = 1 << 20
-"""Largest count of context numbers per part in mode `exact`; results do not depend on it."""
+MAX_EXACT_NUMBERS = 1 << 20  # most context numbers per part in mode `exact`; results do not depend on it
 MAX_FLOAT_NUMBERS = 1 << 24
 """The same in mode `float`, where results may depend on it: contexts up to 800 numbers per row are never split."""
 

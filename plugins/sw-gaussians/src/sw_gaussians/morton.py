@@ -7,10 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-BITS = 21
-"""Bits per axis; three axes fill an int64."""
-ROWS_AT_ONCE = 1 << 18
-"""Points whose cells are found together: those of all would be the largest thing in memory."""
+BITS = 21  # per axis; three axes fill an int64
+ROWS_AT_ONCE = 1 << 18  # points whose cells are found together: those of all would be the largest thing in memory
 _SPREAD = (
     (32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3),
     (2, 0x1249249249249249),
