@@ -1,23 +1,19 @@
-"""Measure rungs of wisp's training on a scene, its rate points, and its bytes beside HAC++ and CAT-3DGS at equal PSNR.
+"""Measure what each part of wisp brings on a scene, and its bytes beside HAC++ and CAT-3DGS at equal PSNR.
 
-    SPLATWIZARD_DATA=DATA python benchmarks/wisp_ladder.py OUT --scene DATA/fox --images images_2 --cap 74000 --jobs 6
-    python benchmarks/wisp_ladder.py OUT --scene DATA/fox --images images_2 --cap 74000 --only "half r3" --deadline 480
-    python benchmarks/wisp_ladder.py OUT --scene DATA/fox --images images_2 --cap 74000 --table
+    SPLATWIZARD_DATA=DATA python benchmarks/wisp_ladder.py OUT --scene DATA/fox --images images_2 --jobs 6
+    python benchmarks/wisp_ladder.py OUT --scene DATA/fox --images images_2 --only "without" --deadline 480
+    python benchmarks/wisp_ladder.py OUT --scene DATA/fox --images images_2 --table
+    python benchmarks/wisp_ladder.py OUT --scene DATA/lego --set resolution=2 --preset quick --table
 
 Cells are those of sweep_cells.py: one `sw bench`, resumed by the same command; at the end stands which ran, were there,
-are missing, unfinished or failed. Families, each at r1, r3, r5 and two points beyond:
+are missing, unfinished or failed. Families, each at r1 to r5:
 
-wisp        as its preset has it
-half        --cap 1.6 times as many grown, 0.81 caps begin at factor 1: the worthier half
-fast        the same from a scene of preset `fast` of 3dgs: of few photographs the better one
+wisp         as its preset has it
+progressive  with layers, a quarter of the steps after their beginning draw a prefix
+mcmc         from a scene that MCMC grows; fast: from one of preset `fast` (one of the two is what the preset has)
 
-Rungs, at r3 and once: half with
-
-settled     the last quarter of the grown scene without noise and loss terms, and the mean of its last tenth
-long        30,000 steps of growing
-slow        step sizes of a training that goes on: positions and latents a tenth, shapes, opacities and colours a third
-view        latents alone a tenth
-latents     steps of the latents by what the pictures depend on
+Rungs: wisp at r3, one thing changed, names in RUNGS. Their table has the difference in dB, the factor of the bytes, and
+both as one: ln(bytes over bytes) less the dB times ln(bytes) per dB of the family wisp between r2 and r4.
 
 Ratio: at the PSNR of each point of a baseline, bytes on the lower hull of a family, linear in log bytes, over that
 point's bytes; a point below the hull counts at its smallest file, one above is not reached. Bars: 0.50 and 0.75.
@@ -38,62 +34,53 @@ from rich.console import Console
 from rich.table import Table
 from sweep_cells import Cell, add_options, chosen, print_outcomes, run_cells
 
-RATES = ("r1", "r3", "r5")
-BEYOND = {"high": (1.25e-5, 1.6, 0.3), "highest": (6e-6, 2.0, 0.25)}
-"""Name of a point beyond r5 -> lambda, factor of the cap, eta."""
+RATES = ("r1", "r2", "r3", "r4", "r5")
 COLUMNS = ("PSNR dB", "of training views", "SSIM", "bytes", "splats", "train s", "encode s", "decode s")
-BASELINES = {"hac-plus": (0.50, RATES), "cat-3dgs": (0.75, ("r1", "r3", "r6"))}
+BASELINES = {"hac-plus": (0.50, ("r1", "r3", "r5")), "cat-3dgs": (0.75, ("r1", "r3", "r6"))}
 """Method -> bar of the mean ratio, and its rate points."""
-GROWN = "pretrained.density.settings"
-SLOW = {"shape": (1.3e-3, 1.3e-4), "opacity": (8e-3, 8e-4), "colour": (8e-4, 8e-5)}
-TENTH = {"latents": (5e-4, 5e-5)}
-RUNGS: Mapping[str, Sequence[str]] = {
-    "settled": [
-        *(f"{GROWN}.{key}=22500" for key in ("stop", "noise_stop", "terms_stop")),
-        "pretrained.fast.average=0.1",
+FAMILIES: Mapping[str, Sequence[str]] = {
+    "wisp": [],
+    "progressive": ["layers.progressive=true", "layers.train=0.25"],
+    "mcmc": [
+        "pretrained.preset=mcmc", "pretrained.iterations=12000", "pretrained.scale_schedule=true",
+        "pretrained.density.settings.cap=none", "budget.density=1",
     ],
-    "long": ["pretrained.iterations=30000"],
+    "fast": ["pretrained.preset=fast", "budget.density=0.006"],
+}  # fmt: skip
+"""Family -> its values."""
+SLOW = {"means": (1.6e-6, 1.6e-7), "shape": (1.3e-3, 1.3e-4), "opacity": (8e-3, 8e-4), "colour": (8e-4, 8e-5)}
+RUNGS: Mapping[str, Sequence[str]] = {
+    "without removal": ["prune.rd=false"],
+    "without copies": ["prune.respawn=0"],
+    "without context": ["context.kind=none"],
+    "without adaptive steps": ["steps.adaptive=false"],
+    "without fits": ["context.fit=0"],
+    "small networks": ["context.networks=small"],
+    "cells of the middle scale": ["positions.rule=mid"],
+    "latents by sensitivity": ["appearance.steps=sensitivity"],
+    "longer start": ["pretrained.iterations=18000"],
     "slow": [
         f"lr.{name}.{end}={value}"
-        for name, pair in ({"means": (1.6e-6, 1.6e-7)} | SLOW | TENTH).items()
+        for name, pair in (SLOW | {"latents": (5e-4, 5e-5)}).items()
         for end, value in zip(("first", "last"), pair, strict=True)
     ],
-    "view": ["lr.latents.first=5e-4", "lr.latents.last=5e-5"],
-    "latents": ["appearance.steps=sensitivity"],
+    "slow latents": ["lr.latents.first=5e-4", "lr.latents.last=5e-5"],
 }
+"""Rung -> the values that it changes."""
 
 
-def families(cap: int) -> dict[str, list[str]]:
-    """Family -> its values."""
-    half = [f"{GROWN}.cap={round(1.6 * cap)}", f"budget.cap={round(0.54 * cap)}", "budget.cap_factor=1"]
-    return {"wisp": [], "half": half, "fast": [*half, "pretrained.preset=fast", "pretrained.iterations=9000"]}
-
-
-def points(family: str, scene: str, images: str, seed: int, values: Sequence[str]) -> list[Cell]:
-    """A family at its rate points and the two beyond."""
-    found = [Cell(family, "wisp", scene, rate, seed, images=images, sets=tuple(values)) for rate in RATES]
-    for name, (weight, factor, eta) in BEYOND.items():
-        own = (f"budget.cap_factor={factor}", f"rate_term.lambda_={weight}", f"positions.eta={eta}")
-        kept = [each for each in values if not each.startswith("budget.cap_factor=")]
-        found.append(Cell(f"{family}-{name}", "wisp", scene, "r5", seed, images=images, sets=(*kept, *own)))
-    return found
-
-
-def cells_of(scene: str, images: str, cap: int, seeds: int) -> dict[str, list[Cell]]:
+def cells_of(scene: str, images: str, seeds: int, preset: str = "paper") -> dict[str, list[Cell]]:
     """Row group -> its cells: families, rungs, baselines."""
-    found: dict[str, list[Cell]] = {}
-    every = families(cap)
-    for seed in range(seeds):
-        for family, sets in every.items():
-            found.setdefault(family, []).extend(points(family, scene, images, seed, sets))
-        for rung, sets in RUNGS.items():
-            values = (*every["half"], *sets)
-            found.setdefault(rung, []).append(Cell(rung, "wisp", scene, "r3", seed, images=images, sets=values))
-        for method, (_, rates) in BASELINES.items():
-            found.setdefault(method, []).extend(
-                Cell(method, method, scene, rate, seed, images=images) for rate in rates
-            )
-    return found
+
+    def cells(label: str, method: str, rates: Sequence[str], values: Sequence[str]) -> list[Cell]:
+        return [
+            Cell(label.replace(" ", "-"), method, scene, rate, seed, preset, images, tuple(values))
+            for seed in range(seeds) for rate in rates
+        ]  # fmt: skip
+
+    found = {family: cells(family, "wisp", RATES, values) for family, values in FAMILIES.items()}
+    found |= {rung: cells(rung, "wisp", ("r3",), values) for rung, values in RUNGS.items()}
+    return found | {method: cells(method, method, rates, ()) for method, (_, rates) in BASELINES.items()}
 
 
 def measured(cell: Cell, out: Path) -> list[tuple[float, int]]:
@@ -151,11 +138,37 @@ def print_cells(groups: Mapping[str, Sequence[Cell]], out: Path, console: Consol
     console.print(table)
 
 
+def mean_of(cells: Sequence[Cell], out: Path) -> tuple[float, float] | None:
+    """Mean PSNR and mean log bytes of those that are finished; None: none is."""
+    found = [each for cell in cells for each in measured(cell, out)]
+    if not found:
+        return None
+    return statistics.fmean(psnr for psnr, _ in found), statistics.fmean(math.log(size) for _, size in found)
+
+
+def print_rungs(groups: Mapping[str, Sequence[Cell]], out: Path, console: Console) -> None:
+    """Print what each rung changes at r3, a row a rung."""
+    low, own, high = (mean_of([c for c in groups["wisp"] if c.rate == r], out) for r in ("r2", "r3", "r4"))
+    if own is None:
+        return
+    slope = (high[1] - low[1]) / (high[0] - low[0]) if low and high and high[0] != low[0] else None
+    table = Table(title=f"rungs at r3, {own[0]:.2f} dB in {math.exp(own[1]):,.0f} bytes", title_justify="left")
+    for head in ("rung", "dB", "bytes x", "bytes x at equal PSNR", "n"):
+        table.add_column(head)
+    for rung in RUNGS:
+        if each := mean_of(groups[rung], out):
+            gain, more = each[0] - own[0], each[1] - own[1]
+            equal = "" if slope is None else f"{math.exp(more - slope * gain):.3f}"
+            n = sum(bool(measured(cell, out)) for cell in groups[rung])
+            table.add_row(rung, f"{gain:+.2f}", f"{math.exp(more):.3f}", equal, str(n))
+    console.print(table)
+
+
 def print_ratios(groups: Mapping[str, Sequence[Cell]], out: Path, console: Console) -> None:
     """Print the mean ratio of each family and baseline, seed 0, and what is not reached."""
     for method, (bar, _) in BASELINES.items():
         theirs = {cell.rate: measured(cell, out) for cell in groups[method] if cell.seed == 0}
-        for family in families(0):
+        for family in FAMILIES:
             ours = [each for cell in groups[family] if cell.seed == 0 for each in measured(cell, out)]
             if not ours or not any(theirs.values()):
                 continue
@@ -174,11 +187,10 @@ def main() -> int:
     add_options(parser)
     parser.add_argument("--scene", required=True, help="as `sw run --scene` takes it")
     parser.add_argument("--images", default="", help="folder of pictures (default: the scene's own)")
-    parser.add_argument("--cap", type=int, required=True, help="wisp's own for the scene: 31.25 times the root of its "
-                        "training pixels")  # fmt: skip
+    parser.add_argument("--preset", default="paper", help="of all of them (default: paper)")
     parser.add_argument("--seeds", type=int, default=1, help="(default: 1)")
     args = parser.parse_args()
-    groups = cells_of(args.scene, args.images, args.cap, args.seeds)
+    groups = cells_of(args.scene, args.images, args.seeds, args.preset)
     cells = chosen((cell for each in groups.values() for cell in each), args)
     console = Console(width=200)
     outcomes = run_cells(cells, args.out, args)
@@ -186,6 +198,7 @@ def main() -> int:
         print_outcomes(outcomes, console, planned=args.plan)
     if not args.plan:
         print_cells(groups, args.out, console)
+        print_rungs(groups, args.out, console)
         print_ratios(groups, args.out, console)
     return int(any(outcome.state == "failed" for outcome in outcomes.values()))
 

@@ -394,14 +394,27 @@ def test_the_table_of_removal_has_presets_and_scores_at_equal_counts(monkeypatch
 
 def test_the_ladder_of_wisp_has_its_families_beside_the_baselines(monkeypatch, bench, tmp_path, capsys):
     ladder = module("wisp_ladder", monkeypatch)
-    words = ("--scene", "demo:tiny", "--cap", "1000", "--only", "half", "--only", "hac", "--only", "fast")
+    words = ("--scene", "demo:tiny", "--only", "progressive", "--only", "hac", "--only", "without-removal")
     status, fake = bench(ladder, tmp_path / "out", *words)
     told = capsys.readouterr().out
     assert (status, len(fake.commands)) == (0, 1)
-    assert "13 cells: 13 ran" in told
-    assert "half over hac-plus" in told
-    beyond = {cell.label: cell.sets for cell in ladder.cells_of("demo:tiny", "", 1000, 1)["half"]}
-    assert "rate_term.lambda_=1.25e-05" in beyond["half-high"]
+    assert "9 cells: 9 ran" in told
+    assert "progressive over hac-plus" in told
+    cells = ladder.cells_of("demo:tiny", "", 2, "quick")["without context"]
+    assert {(cell.rate, cell.seed, cell.preset, cell.sets) for cell in cells} == {
+        ("r3", seed, "quick", ("context.kind=none",)) for seed in (0, 1)
+    }
+
+
+def test_a_rung_is_told_at_equal_psnr(monkeypatch, tmp_path, capsys):
+    ladder = module("wisp_ladder", monkeypatch)
+    found = {"r2": (30.0, 100), "r3": (31.0, 200), "r4": (32.0, 400), "without removal": (30.5, 200)}
+    monkeypatch.setattr(ladder, "measured", lambda cell, out: [found[cell.label if cell.label in found else cell.rate]]
+                        if cell.label in ("wisp", "without-removal") else [])  # fmt: skip
+    found["without-removal"] = found.pop("without removal")
+    ladder.print_rungs(ladder.cells_of("demo:tiny", "", 1), tmp_path, ladder.Console(width=120))
+    row = next(line for line in capsys.readouterr().out.splitlines() if "without removal" in line)
+    assert [word for word in row.split() if word[0] in "+-.0123456789"] == ["-0.50", "1.000", "1.414", "1"]
 
 
 def test_bytes_at_equal_psnr_stand_on_the_lower_hull(monkeypatch):
