@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import islice
 from typing import Any, Literal
 
 import torch
@@ -14,6 +15,9 @@ from splatwizard_core.api import Camera, Rasterizer
 from sw_cat_3dgs.context import STEP_OFFSET, CatContext, plane_bits
 from sw_cat_3dgs.fast import plane_graphs, plane_sites
 from sw_cat_3dgs.rate_model import CatRateModel
+
+VIEWS_AT_ONCE = 16
+"""Views whose radii are counted together, 64 bytes an anchor: each operator is launched once for all of them."""
 
 Trained = Literal["everything", "spatial models", "all but planes", "nothing"]
 
@@ -57,9 +61,10 @@ class CatAnchors(CodedAnchors):
     @torch.no_grad()
     def count_views(self, cameras: Iterable[Camera], rasterizer: Rasterizer) -> None:
         """Weigh each anchor by how many of the cameras see it; what none sees is dropped."""
-        seen, balls = torch.zeros_like(self.view_weights), self.balls()
-        for camera in cameras:
-            seen += rasterizer.visible_filter(balls, camera.to(self.device)) > 0
+        seen, balls, left = torch.zeros_like(self.view_weights), self.balls(), iter(cameras)
+        while some := list(islice(left, VIEWS_AT_ONCE)):
+            radii = [rasterizer.visible_filter(balls, camera.to(self.device)) for camera in some]
+            seen += (torch.stack(radii) > 0).sum(dim=0)
         self.view_weights = self.view_factor * seen / seen.mean().clamp(min=1e-12)
         self.views_stale = False
 
