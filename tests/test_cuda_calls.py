@@ -297,6 +297,22 @@ def test_gaussians_that_are_alike_are_checked_once(calls):
         AlikeGaussians().spawned(drawn, (*given[:3], rand(n, 2), *given[4:]))
 
 
+def test_statistics_of_anchors(calls):
+    from sw_anchors.anchors import AnchorSelection
+    from sw_anchors.growth import accumulate_anchor_statistics
+
+    rows, drawn, radii = torch.tensor([1, 4]), torch.tensor([0, 3, 7]), torch.ones(3, dtype=torch.int32)
+    shapes = {"opacity_accum": (5,), "anchor_denom": (5,), "offset_grad_accum": (5, 4), "offset_denom": (5, 4)}
+    model = SimpleNamespace(**{name: rand(*shape) for name, shape in shapes.items()})
+    version = model.offset_denom._version
+    accumulate_anchor_statistics(model, AnchorSelection(rows, rand(2, 4), drawn), rand(3, 4)[:, :2], radii)
+    (call,) = calls["add_statistics"]
+    assert (call.seen, call.k, call.count, call.total) == (2, 4, 3, 5)
+    assert (call.rows, call.drawn, call.radii) == (rows.data_ptr(), drawn.data_ptr(), radii.data_ptr())
+    assert (call.opacity_accum, call.offset_denom) == (model.opacity_accum.data_ptr(), model.offset_denom.data_ptr())
+    assert model.offset_denom._version > version
+
+
 LEVELS = [4.0, 8.0], [5, 9], [0, 216], [1, 0], 9
 """A dense and a hashed level over three axes, of 216 and 512 entries."""
 

@@ -207,3 +207,20 @@ def view_networks_backward(
     total: int | None = None,
     device: int | None = None,
 ) -> Structure: ...
+def add_statistics(
+    *,
+    rows: Tensor | Array[Any] | int,
+    opacities: Tensor | Array[Any] | int,
+    drawn: Tensor | Array[Any] | int,
+    gradients: Tensor | Array[Any] | int,
+    radii: Tensor | Array[Any] | int,
+    seen: int | None = None,
+    k: int | None = None,
+    count: int | None = None,
+    total: int | None = None,
+    opacity_accum: Tensor | Array[Any] | int,
+    anchor_denom: Tensor | Array[Any] | int,
+    offset_grad_accum: Tensor | Array[Any] | int,
+    offset_denom: Tensor | Array[Any] | int,
+    device: int | None = None,
+) -> Structure: ...

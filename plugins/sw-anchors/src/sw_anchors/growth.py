@@ -6,7 +6,6 @@ Source: Scaffold-GS (arXiv 2312.00109) as used by HAC (arXiv 2403.14530), follow
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -14,11 +13,10 @@ from torch import Tensor
 
 from splatwizard_core.api import EmptyModel, SplatOptimizer
 from sw_anchors.anchors import AnchorModel, AnchorSelection
-from sw_anchors.fast import rows as fast_rows
+from sw_anchors.fast import statistics as fast_statistics
 
 MAX_LOG_BASE_SCALE = 0.05
 """Upper bound of the log base scales (columns 3 to 5), applied at every adjustment."""
-_OF_ANCHORS, _OF_OFFSETS = fast_rows.AlikeRows(fast_rows.Way.ADD), fast_rows.AlikeRows(fast_rows.Way.ADD)
 
 
 @dataclass(frozen=True)
@@ -40,21 +38,16 @@ def accumulate_anchor_statistics(
     gradients   [M,2] derivative of the loss by the projected centre, NDC units (RenderResult.grad2d)
     radii       [M] pixels; Gaussians with radius 0 do not count
     """
+    if fast_statistics.fits(model, selection, gradients, radii):
+        fast_statistics.add(model, selection, gradients, radii)
+        return
     # Every index occurs once, and what was not drawn adds 0: a mask as an index would be waited for on a GPU.
-    rows, seen = selection.rows, (radii > 0).to(model.offset_denom)
-    sums = selection.opacities.clamp(min=0).sum(dim=1), model.anchor_denom.new_ones(len(rows))
-    fits = fast_rows.fit_kernels(model.opacity_accum)
-    (_OF_ANCHORS.add if fits else add_rows)(rows, sums, (model.opacity_accum, model.anchor_denom))
+    rows, offsets, seen = selection.rows, selection.offset_index(), (radii > 0).to(model.offset_denom)
+    model.opacity_accum.index_add_(0, rows, selection.opacities.clamp(min=0).sum(dim=1))
+    model.anchor_denom.index_add_(0, rows, model.anchor_denom.new_ones(len(rows)))
     norms = torch.linalg.vector_norm(gradients, dim=1).to(model.offset_grad_accum)
-    totals = model.offset_grad_accum.view(-1), model.offset_denom.view(-1)
-    add = _OF_OFFSETS.add if fits else add_rows
-    add(selection.offset_index(), (norms.masked_fill_(seen == 0, 0), seen), totals)
-
-
-def add_rows(rows: Tensor, sources: Sequence[Tensor], into: Sequence[Tensor]) -> None:
-    """Add row i of each source [V,...] to row rows[i] (int64) of its target."""
-    for source, target in zip(sources, into, strict=True):
-        target.index_add_(0, rows, source)
+    model.offset_grad_accum.view(-1).index_add_(0, offsets, norms.masked_fill_(seen == 0, 0))
+    model.offset_denom.view(-1).index_add_(0, offsets, seen)
 
 
 @torch.no_grad()

@@ -17,7 +17,7 @@ ANCHORS_CUDA = NativeModule(
         "kernels/spawn.h",
         "kernels/cuda/*.h",
     ),
-    cuda_sources=("kernels/cuda/spawn.cu", "kernels/cuda/rows.cu", "kernels/cuda/networks.cu"),
+    cuda_sources=tuple(f"kernels/cuda/{name}.cu" for name in ("spawn", "rows", "networks", "statistics")),
     without="anchors are decoded by torch operations: the same numbers, slower",
 )
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from sw_anchors import rate_model
+from sw_anchors.anchors import AnchorSelection
 from sw_anchors.fast import rows as fast_rows
-from sw_anchors.fast import sample_bits
+from sw_anchors.fast import sample_bits, statistics
 from sw_anchors.fast.rows import add_rows, load_rows, noisy_rows, put_rows, take_rows
+from sw_anchors.growth import accumulate_anchor_statistics
 from sw_anchors.native import ANCHORS
 
 ON_CUDA = ANCHORS.available(cuda=True)
@@ -126,3 +130,50 @@ def test_rows_are_added_where_they_are_named(both_forms):
     for i, row in enumerate(rows.tolist()):
         expected[row] += sources[2][i]
     torch.testing.assert_close(compute()[2], expected)
+
+
+@pytest.mark.parametrize(
+    ("n", "v", "k", "share"), [(900, 300, 10, 0.3), (40, 40, 1, 1.0), (30, 5, 4, 0.0), (9, 0, 3, 0.0)]
+)
+def test_statistics_of_a_view_are_those_of_torch(monkeypatch, n, v, k, share):
+    draw, generator = drawer(4), torch.Generator().manual_seed(5)
+    rows = torch.randperm(n, generator=generator)[:v].to("cuda")
+    drawn = torch.nonzero(torch.rand(v * k, generator=generator) < share).squeeze(1).to("cuda")
+    selection = AnchorSelection(rows, draw(v, k), drawn)
+    gradients, radii = draw(len(drawn), 2), torch.randint(0, 3, (len(drawn),), generator=generator).int().to("cuda")
+    gradients[radii == 0] = float("nan")  # of what was not drawn
+    found = []
+    for kernels in (True, False):
+        if not kernels:
+            monkeypatch.setattr(statistics, "fits", lambda *_: False)
+        shapes = {"opacity_accum": (n,), "anchor_denom": (n,), "offset_grad_accum": (n, k), "offset_denom": (n, k)}
+        model = SimpleNamespace(**{name: torch.ones(shape, device="cuda") for name, shape in shapes.items()})
+        if kernels:
+            assert statistics.fits(model, selection, gradients, radii)
+        for _ in range(2):
+            accumulate_anchor_statistics(model, selection, gradients, radii)
+        found.append(vars(model))
+    for name, expected in found[1].items():
+        torch.testing.assert_close(found[0][name], expected, rtol=1e-6, atol=1e-6, msg=name)
+
+
+@pytest.mark.parametrize("count", [300, 0])
+def test_rows_that_are_alike_are_copied_as_others(count):
+    draw, n, v = drawer(6), 500, 320
+    rows = torch.randperm(n, generator=torch.Generator().manual_seed(7))[:count].to("cuda")
+    into = [torch.zeros(v, 30, device="cuda"), torch.zeros(v, 3, device="cuda")]
+    load, put, add = (fast_rows.AlikeRows(way) for way in fast_rows.Way)
+    shapes = [torch.Size((n, 10, 3)), torch.Size((n, 3)), torch.Size((n, 3))]
+    for _ in range(3):
+        sources = [draw(n, 10, 3), draw(n, 3)]
+        load.load(rows, sources, into)
+        assert all(torch.equal(x[:count], y.flatten(1)[rows]) for x, y in zip(into, sources, strict=True))
+        torch.empty(n * 40, device="cuda").fill_(7)  # memory that is lent again is no zeros
+        first, last, none = put.put(rows, [*into, None], shapes)
+        assert none is None
+        for found, source in ((first, into[0]), (last, into[1])):
+            expected = torch.zeros(n, source.shape[1], device="cuda").index_copy_(0, rows, source[:count])
+            assert torch.equal(found.flatten(1), expected)
+        expected = [first.flatten(1).index_add(0, rows, into[0][:count]), last.index_add(0, rows, into[1][:count])]
+        add.add(rows, [*into, None], [first, last, None])
+        assert all(torch.equal(x.flatten(1), y) for x, y in zip((first, last), expected, strict=True))

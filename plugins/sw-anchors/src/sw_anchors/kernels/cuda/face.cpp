@@ -8,6 +8,7 @@
 #include "kernels.h"
 #include "networks.h"
 #include "rows.h"
+#include "statistics.h"
 
 using namespace sw_anchors;
 using splatwizard::guarded_on_gpu;
@@ -140,5 +141,14 @@ SW_OPERATION(sw_anchors_cuda, view_networks_backward) {
                             const_cast<float*>(call->by_color)}};
     cuda::networks_backward(viewed_of(*call), networks, call->alpha, by, call->to_features, call->partial,
                             call->to_parameters, stream);
+  });
+}
+
+SW_OPERATION(sw_anchors_cuda, add_statistics) {
+  return guarded_on_gpu(call, [&](cudaStream_t stream) {
+    if (call->k < 1) refuse("anchors with %lld offsets", (long long)call->k);
+    cuda::add_statistics({call->seen, call->k, call->count, call->rows, call->opacities, call->drawn, call->gradients,
+                          call->radii},
+                         {call->opacity_accum, call->anchor_denom, call->offset_grad_accum, call->offset_denom}, stream);
   });
 }

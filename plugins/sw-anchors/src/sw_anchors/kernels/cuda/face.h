@@ -128,3 +128,19 @@ typedef struct {
   int64_t total;
 } view_networks_backward_call;
 SW_OPERATION(sw_anchors_cuda, view_networks_backward);
+
+// Statistics of one view for growing and pruning, added to those of `total` anchors.
+typedef struct {
+  sw_head head;
+  const int64_t* rows;          // [seen] anchors, each at most once
+  const float* opacities;       // [seen, k] of their offsets
+  const int64_t* drawn;         // [count] Gaussians in 0 .. seen k - 1, each at most once
+  const float* gradients;       // [count, 2] by their projected centres
+  const int32_t* radii;         // [count] of 0: it does not count
+  int64_t seen, k, count, total;
+  float* opacity_accum;         // [total] opacities > 0
+  float* anchor_denom;          // [total] views in which an anchor was seen
+  float* offset_grad_accum;     // [total, k] norms of gradients
+  float* offset_denom;          // [total, k] views in which an offset was drawn
+} add_statistics_call;
+SW_OPERATION(sw_anchors_cuda, add_statistics);
