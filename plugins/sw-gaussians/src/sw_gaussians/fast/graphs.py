@@ -211,11 +211,12 @@ class Watched:
 
 def plain_values(holder: object, but: Collection[str] = ()) -> list[Any]:
     """Return an object's numbers and strings, which decide the operators that run, but those that are named."""
-    return [(name, value) for name, value in vars(holder).items() if _is_plain(value) and name not in but]
+    return [
+        (name, value)
+        for name, value in vars(holder).items()
+        if (type(value) in _PLAIN or (type(value) is tuple and all(type(each) in _PLAIN for each in value)))
+        and name not in but
+    ]
 
 
-def _is_plain(value: Any) -> bool:
-    return type(value) in _PLAIN or (type(value) is tuple and all(type(each) in _PLAIN for each in value))
-
-
-_PLAIN = (bool, int, float, str)
+_PLAIN = frozenset((bool, int, float, str))
