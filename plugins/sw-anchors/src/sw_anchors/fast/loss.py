@@ -33,7 +33,7 @@ class _MeanProduct(torch.autograd.Function):
 def product_and_slopes(scales: Tensor, count: int | Tensor) -> tuple[Tensor, Tensor]:
     """Return `mean_product` without gradient, and count times its gradient, the products of the two other scales."""
     others = scales.roll(1, 1) * scales.roll(-1, 1)
-    return (others[:, 0] * scales[:, 0]).sum() / count, others
+    return (others.select(1, 0) * scales.select(1, 0)).sum() / count, others
 
 
 def weighted_sum(start: Tensor, *terms: tuple[float, Tensor]) -> tuple[Tensor, ...]:

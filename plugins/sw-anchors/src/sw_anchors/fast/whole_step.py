@@ -39,7 +39,10 @@ class WholeAnchorStep(WholeStep):
             count = stage.counted(result)
             with torch.no_grad():
                 volume, others = product_and_slopes(result.inputs.scales, count)
-                by["scales"] += others * (settings.volume / count)
+                if isinstance(count, int):
+                    by["scales"].add_(others, alpha=settings.volume / count)
+                else:
+                    by["scales"].addcmul_(others, settings.volume / count)
             return {"volume": (settings.volume, volume), **all_weighted(stage.extra_loss(model, result, step))}
 
         found = self.through(inputs, options, settings.lambda_dssim, state, view, camera, background, terms)
