@@ -23,7 +23,7 @@ RUN = (
 )  # fmt: skip
 OF_GLIBC = {"libc.so.6", "libm.so.6", "libpthread.so.0", "libdl.so.2", "librt.so.1", "ld-linux-x86-64.so.2"}
 MOST_MORE = 30.0
-"""Seconds that install and first run may take beyond a second run."""
+"""Seconds on a core that install and first run, on one thread, may take beyond a second run."""
 
 
 @pytest.fixture(scope="module")
@@ -48,18 +48,25 @@ def without_compiler(environment: FreshEnvironment, cache: Path) -> dict[str, st
     return {"PATH": str(environment.prefix / "bin"), "CXX": "", "SPLATWIZARD_CACHE": str(cache)}
 
 
+def since(started: tuple[float, float] = (0.0, 0.0)) -> tuple[float, float]:
+    """Seconds on a core of the processes that were waited for, whoever else is busy, and on the clock."""
+    times = os.times()
+    return times.children_user + times.children_system - started[0], time.monotonic() - started[1]
+
+
 def test_a_first_table_and_a_page_need_no_compiler(wheels, environment, tmp_path):
     around = without_compiler(environment, tmp_path / "cache")
-    started = time.monotonic()
-    environment.install(*wheels)
+    started = since()
+    environment.pip_install(*wheels)
     done = environment.run(*RUN, "--out", str(tmp_path / "first"), **around)
-    cold = time.monotonic() - started
+    cold = since(started)
     assert "compil" not in done.stdout + done.stderr
-    started = time.monotonic()
+    started = since()
     environment.run(*RUN, "--out", str(tmp_path / "second"), **around)
-    warm = time.monotonic() - started
-    print(f"install and first run {cold:.1f} s, second run {warm:.1f} s")
-    assert cold - warm < MOST_MORE
+    warm = since(started)
+    for which, seconds in (("install and first run", cold), ("second run", warm)):
+        print(f"{which} {seconds[0]:.1f} s on a core, {seconds[1]:.1f} s by the clock")
+    assert cold[0] - warm[0] < MOST_MORE
     (file,) = (tmp_path / "first").rglob("*.swz")
     environment.run("export", str(file), str(tmp_path / "page.html"), **around)
     assert b"<canvas" in (tmp_path / "page.html").read_bytes()
