@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from sw_compress import rounding
 from sw_compress.coders import columns_bits
 from sw_compress.rounding import (
     Rounding,
@@ -56,16 +57,27 @@ def test_classes_on_a_device_are_those_of_the_codec(count: int):
 
 
 def test_one_attribute_changes_alone(ball):
-    rounding = Rounding(ball(300), 0.4, True)
-    whole = rounding.model_at(STEPS)
+    found = Rounding(ball(300), 0.4, True)
+    whole = found.model_at(STEPS)
     finer = replace(STEPS, of={**STEPS.of, "rest": 0.001})
-    changed = rounding.change(rounding.model_at(STEPS), "rest", finer)
-    assert torch.equal(changed.sh_rest, rounding.model_at(finer).sh_rest)
+    changed = found.change(found.model_at(STEPS), "rest", finer)
+    assert torch.equal(changed.sh_rest, found.model_at(finer).sh_rest)
     assert not torch.equal(changed.sh_rest, whole.sh_rest)
     assert torch.equal(changed.quats, whole.quats)
     for name in ("quat", "opacity", "dc", "scale", "positions"):  # and back again, in place
-        assert rounding.change(changed, name, STEPS) is changed
-    assert torch.equal(rounding.change(changed, "rest", STEPS).sh_rest, whole.sh_rest)
+        assert found.change(changed, name, STEPS) is changed
+    assert torch.equal(found.change(changed, "rest", STEPS).sh_rest, whole.sh_rest)
+
+
+def test_what_is_not_kept_is_found_again(ball, monkeypatch):
+    model = ball(300)
+    known = Rounding(model, 0.4, True).model_at(STEPS)
+    monkeypatch.setattr(rounding, "TURNED_ONCE", 100)
+    monkeypatch.setitem(rounding.ROWS_AT_ONCE, "cpu", 128)
+    again = Rounding(model, 0.4, True)
+    for found in (again.model_at(STEPS), again.overwrite(STEPS)):
+        for name in known.RAW:
+            assert torch.equal(getattr(found, name), getattr(known, name)), name
 
 
 @pytest.mark.parametrize("spread", [0, 3, 40_000])

@@ -25,6 +25,8 @@ from sw_compress.rows import IMPORTANCE, like, select
 
 ROWS_AT_ONCE = {"cpu": 1 << 14, "cuda": 1 << 18}
 """Rows that are doubles at a time: those of all would be the largest thing in memory."""
+TURNED_ONCE = 1 << 18
+"""Gaussians up to which a CPU keeps scales and quaternions as they are rounded, 36 bytes of each."""
 NAMES = {"means": "positions", "sh_dc": "dc", "opacity_logits": "opacity", "log_scales": "scale", "quats": "quat",
          "sh_rest": "rest"}  # fmt: skip
 """Parameter -> attribute that has a level."""
@@ -55,7 +57,9 @@ class Rounding:
         classes = torch.zeros(self.rows, dtype=torch.int32, device=device) if self.classes is None else self.classes
         self.factors = torch.from_numpy(precision.FACTORS).to(device)[(classes + precision.MOST).long()]
         self._color = torch.from_numpy(COLOR).to(device)
-        self.scales, self.xyz = canonical(self.model.log_scales.detach(), self.model.quats.detach())
+        self._turned: tuple[Tensor, Tensor] | None = None
+        if device.type != "cpu" or self.rows <= TURNED_ONCE:
+            self._turned = canonical(self.model.log_scales.detach(), self.model.quats.detach())
         self.basis = self._basis() if own_basis and self.rest.numel() else None
 
     @property
@@ -81,7 +85,7 @@ class Rounding:
 
     def overwrite(self, steps: Steps) -> GaussianModel:
         """Bring the model itself to these steps, where there is no memory for two: nothing else can be asked then."""
-        for name in NAMES.values():
+        for name in ("positions", "dc", "opacity", "quat", "scale", "rest"):  # quaternions are turned by scales
             self.change(self.model, name, steps)
         return self.model
 
@@ -136,8 +140,14 @@ class Rounding:
         elif name == "opacity":
             values = self.model.opacity_logits.detach()[rows, None].double().clamp(-MAX_LOGIT, MAX_LOGIT)
         else:
-            values = (self.scales if name == "scale" else self.xyz)[rows]
+            values = self._turned_rows(rows)[name == "quat"]
         return (values / self._widths(name, steps, rows)[:, None]).round_()
+
+    def _turned_rows(self, rows: slice) -> tuple[Tensor, Tensor]:
+        """Log scales [n,3] and x, y, z [n,3] of some rows, as `canonical` has them."""
+        if self._turned is not None:
+            return self._turned[0][rows], self._turned[1][rows]
+        return _canonical(self.model.log_scales.detach()[rows], self.model.quats.detach()[rows])
 
     def _widths(self, name: str, steps: Steps, rows: slice) -> Tensor:
         """Step of each row [n]."""
