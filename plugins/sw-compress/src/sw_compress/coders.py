@@ -180,7 +180,7 @@ class _Sections:
     def __init__(self, rounding: Rounding, count: int, table_bits: float) -> None:
         self._rounding, self._count, self._table_bits = rounding, count, table_bits
         if rounding.classes is None:
-            self._first = torch.zeros(rounding.rows, dtype=torch.int64, device=rounding.factors.device)
+            self._first = torch.zeros(rounding.rows, dtype=torch.int64, device=rounding.model.device)
             self._first_count = 1
         else:
             self._first, self._first_count = equal_classes(rounding.classes.long(), count), count
@@ -189,7 +189,7 @@ class _Sections:
         """Bits of the classes themselves."""
         if self._rounding.classes is None:
             return 0.0
-        return columns_bits(self._rounding.classes[:, None])
+        return columns_bits(self._rounding.classes[:, None].int())
 
     def bits(self, name: str, steps: Steps) -> float:
         """Bits of the columns of an attribute."""

@@ -82,8 +82,8 @@ class Reduction:
         return max(count, round(whole * (count / whole) ** power))
 
     def _by(self, count: int, power: float) -> GaussianModel:
-        give_back()  # what drawing holds on to
         rows = self.pruning.rows(self.kept(count, power))
+        give_back()  # what drawing holds on to
         if len(rows) > count and power < 1:
             # Of some that merged so little is left that nothing is drawn.
             merged, weights = merged_by(self.model, rows, count, self.weights()[rows], faintest=FAINTEST)

@@ -54,8 +54,7 @@ class Rounding:
         self.rows = self.model.num_rows
         self.classes = self._classes_of(power)
         device = model.device
-        classes = torch.zeros(self.rows, dtype=torch.int32, device=device) if self.classes is None else self.classes
-        self.factors = torch.from_numpy(precision.FACTORS).to(device)[(classes + precision.MOST).long()]
+        self._known_factors = torch.from_numpy(precision.FACTORS).to(device)
         self._color = torch.from_numpy(COLOR).to(device)
         self._turned: tuple[Tensor, Tensor] | None = None
         if device.type != "cpu" or self.rows <= TURNED_ONCE:
@@ -66,6 +65,11 @@ class Rounding:
     def rest(self) -> Tensor:
         """Higher SH coefficients that are in use [N,R,3]."""
         return self.model.sh_rest.detach()[:, : (self.model.active_sh_degree + 1) ** 2 - 1]
+
+    @property
+    def factors(self) -> Tensor:
+        """Multipliers [N] float64 of the steps of each Gaussian."""
+        return self._factors(slice(0, self.rows))
 
     @cached_property
     def grid(self) -> PositionGrid:
@@ -103,13 +107,13 @@ class Rounding:
             return on_grid(raw.detach(), replace(self.grid, bits=steps.bits))
         found = torch.zeros_like(raw) if out is None else out
         matrix, width = self._matrix(name, steps), self.rest.shape[1]
-        for rows in blocks(self.rows, self.factors.device):
+        for rows in blocks(self.rows, self.model.device):
             symbols, widths = self._symbols(name, steps, rows, matrix), self._widths(name, steps, rows)[:, None]
             if name == "rest" and matrix is None:
                 values = (symbols.reshape(len(symbols), width, 3) * widths[:, :, None]) @ self._color
                 found[rows, :width] = values.float()
             elif matrix is not None:
-                widths = (steps.of["rest"] / sh_basis.UNIT * self.factors[rows])[:, None]
+                widths = (steps.of["rest"] / sh_basis.UNIT * self._factors(rows))[:, None]
                 found[rows, :width] = ((symbols @ matrix) * widths).reshape(len(symbols), width, 3).float()
             elif name == "dc":
                 found[rows] = ((symbols * widths) @ self._color).float()[:, None, :]
@@ -124,7 +128,7 @@ class Rounding:
         """Integers [N,C] int32 that the file holds."""
         matrix = self._matrix(name, steps)
         return torch.cat(
-            [self._symbols(name, steps, rows, matrix).int() for rows in blocks(self.rows, self.factors.device)]
+            [self._symbols(name, steps, rows, matrix).int() for rows in blocks(self.rows, self.model.device)]
         )
 
     def _symbols(self, name: str, steps: Steps, rows: slice, matrix: Tensor | None) -> Tensor:
@@ -151,29 +155,35 @@ class Rounding:
 
     def _widths(self, name: str, steps: Steps, rows: slice) -> Tensor:
         """Step of each row [n]."""
-        found = steps.of[name] * self.factors[rows]
+        found = steps.of[name] * self._factors(rows)
         return found.clamp_max(max(steps.of[name], LARGEST_QUAT_STEP)) if name == "quat" else found
 
     def _classes_of(self, power: float) -> Tensor | None:
-        """Classes of precision [N] int32; None: all steps are alike."""
+        """Classes of precision [N] int8; None: all steps are alike."""
         if power <= 0:
             return None
         known = getattr(self.model, IMPORTANCE, None)
         if known is not None and known.device.type != "cpu":
-            return classes_on_device(known.detach().double(), power)
+            return classes_on_device(known.detach().double(), power).to(torch.int8)
         if known is not None:
             weights = known.detach().double().numpy()
         else:
             arrays = (getattr(self.model, name).detach().cpu().numpy() for name in ("opacity_logits", "log_scales"))
             weights = precision.footprints(*arrays)
-        return torch.from_numpy(precision.classes_of(weights, power)).to(self.model.device)
+        return torch.from_numpy(precision.classes_of(weights, power).astype(np.int8)).to(self.model.device)
+
+    def _factors(self, rows: slice) -> Tensor:
+        """Multipliers [n] float64 of the steps of some rows."""
+        if self.classes is None:
+            return self._known_factors[precision.MOST].expand(len(range(self.rows)[rows]))
+        return self._known_factors[self.classes[rows].long() + precision.MOST]
 
     def _basis(self) -> sh_basis.Basis:
         stride, count = sh_basis.stride(self.rows), 0
-        covariance = self.factors.new_zeros(3 * self.rest.shape[1], 3 * self.rest.shape[1])
-        for rows in blocks(-(-self.rows // stride), self.factors.device):
+        covariance = self._known_factors.new_zeros(3 * self.rest.shape[1], 3 * self.rest.shape[1])
+        for rows in blocks(-(-self.rows // stride), self.model.device):
             some = slice(rows.start * stride, rows.stop * stride, stride)
-            scaled = self.rest[some].flatten(1).double() / self.factors[some, None]
+            scaled = self.rest[some].flatten(1).double() / self._factors(some)[:, None]
             covariance += scaled.T @ scaled
             count += len(scaled)
         return sh_basis.of_covariance((covariance / max(count, 1)).cpu().numpy())
@@ -188,7 +198,7 @@ class Rounding:
     def _stored(self) -> Tensor:
         """The basis."""
         assert self.basis is not None  # only asked for where it pays
-        return torch.from_numpy(self.basis.matrix.astype(np.float64)).to(self.factors.device)
+        return torch.from_numpy(self.basis.matrix.astype(np.float64)).to(self.model.device)
 
     @cached_property
     def _inverse(self) -> Tensor:

@@ -30,6 +30,8 @@ TAKEN = 0.6
 """Share of a wave's pairs that merge, the cheapest: those left see new partners in the next."""
 ENOUGH = 0.1
 """A wave that merges a smaller share of all Gaussians than this is followed by one that looks further."""
+COLUMNS = 15
+"""Of the table that prices look at."""
 CELLS = 20
 """Bits of a coordinate along the curve."""
 PAIRS_AT_ONCE = {"cpu": 1 << 14, "cuda": 1 << 17}
@@ -123,7 +125,10 @@ class _Pool:
         """These Gaussians, best along a curve; they are overwritten."""
         unit, center = _unit(splats), splats.means.mean(dim=0)
         parts = (Splats(*each) for each in zip(*map(_blocks, splats), strict=True))
-        table = torch.cat([_table(part, unit, center) for part in parts])
+        table, end = splats.means.new_empty(len(splats.means), COLUMNS), 0
+        for part in parts:
+            start, end = end, end + len(part.means)
+            table[start:end] = _table(part, unit, center)
         return cls(splats, weights, table, torch.arange(len(table), device=table.device), unit, center)
 
     @property
