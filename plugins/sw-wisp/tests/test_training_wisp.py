@@ -122,7 +122,7 @@ def test_rate_points_and_presets_resolve():
     assert resolve(Wisp, "paper").config.budget.cap is None
 
 
-@pytest.mark.parametrize("scene", ["nerf_synthetic/lego", "blender:a/folder"])
+@pytest.mark.parametrize("scene", ["nerf_synthetic/lego", "blender:a/folder", "demo:tiny"])
 def test_rendered_scenes_start_from_mcmc(scene):
     found = resolve(Wisp, "paper", scene=scene)
     assert (found.pretrained["preset"], found.pretrained["density.settings.cap"]) == ("mcmc", "none")

@@ -15,7 +15,7 @@ GROWN: Mapping[str, Any] = {
 }
 """A scene that MCMC grows to more splats than stay, since removal beats growth: for scenes without noise."""
 
-BY_DATASET: Mapping[str, Mapping[str, Any]] = {"nerf_synthetic": GROWN, "blender": GROWN}
+BY_DATASET: Mapping[str, Mapping[str, Any]] = dict.fromkeys(("nerf_synthetic", "blender", "demo"), GROWN)
 """Rendered scenes. Of photographs MCMC's splats fit the training views and hang in the air before the others."""
 
 PRESETS: Mapping[str, Mapping[str, Any]] = {
