@@ -75,8 +75,7 @@ def pytest_runtestloop(session: pytest.Session) -> bool | None:
     if cores.JOBS < 2 or sys.platform != "linux" or option.collectonly or session.testsfailed or not session.items:
         return None
     session.config.pluginmanager.getplugin("terminalreporter").showfspath = False  # files mix
-    run_forked(session, cores.JOBS, _threads)
-    return True
+    return run_forked(session, cores.JOBS, _threads) or None
 
 
 @pytest.hookimpl(wrapper=True)

@@ -1,4 +1,4 @@
-"""A plugin of pytest that lets tests of CUDA run without a GPU: kernels are compiled for the CPU, tensors only say "cuda".
+"""A plugin of pytest that lets tests of CUDA run without a GPU: kernels run on the CPU, tensors only say "cuda".
 
     python -m pytest -p cuda_on_cpu -m cuda plugins/sw-hac/tests/fast
 
@@ -10,6 +10,7 @@ headers of `cuda_headers`: what they compute is seen, how fast they are is not, 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import functools
 import hashlib
 import re
@@ -27,7 +28,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from splatwizard_native import NativeModule, toolchain
 
 HEADERS = Path(__file__).with_name("cuda_headers")
-FLAGS = ("-std=c++20", "-O1", "-fPIC", "-w", "-fno-strict-aliasing", "-ffp-contract=off", "-fvisibility=hidden")
+FLAGS = ("-std=c++20", "-O2", "-fPIC", "-w", "-fno-strict-aliasing", "-ffp-contract=off", "-fvisibility=hidden")
 ON_DEVICE = ("-x", "c++", "-D__CUDACC__", "-D__CUDA_ARCH__=900", "-include", "cuda_runtime_api.h")
 STREAM = 4711
 LAUNCH = re.compile(r"(\w+(?:<[^<>;]*>)?)<<<(.*?)>>>\(", re.DOTALL)
@@ -47,8 +48,9 @@ def as_cpp(source: str) -> str:
 def library_of(module: NativeModule) -> Path:
     """Compile a module for GPUs to a library for this CPU, or take that of an earlier run."""
     root = module._root()
-    headers = b"".join(path.read_bytes() for path in sorted(HEADERS.iterdir()))
-    key = hashlib.sha256(module.source_hash().encode() + headers + Path(__file__).read_bytes()).hexdigest()[:16]
+    texts = [as_cpp((root / name).read_text("utf-8")) for name in (*module.sources, *module.cuda_sources)]
+    facts = [module.source_hash(), FLAGS, ON_DEVICE, texts, [path.read_text() for path in sorted(HEADERS.iterdir())]]
+    key = hashlib.sha256(repr(facts).encode()).hexdigest()[:16]
     folder = Path(tempfile.gettempdir()) / "cuda_on_cpu"
     library = folder / f"{module.name}-{key}.so"
     if library.exists():
@@ -57,9 +59,8 @@ def library_of(module: NativeModule) -> Path:
     with tempfile.TemporaryDirectory(dir=folder) as scratch:
         include = [f"-I{HEADERS}", "-isystem", str(toolchain.SHARED_INCLUDE)]
         objects, jobs = [], []
-        for number, name in enumerate((*module.sources, *module.cuda_sources)):
+        for number, (name, text) in enumerate(zip((*module.sources, *module.cuda_sources), texts, strict=True)):
             source, on_device = root / name, name.endswith(".cu")
-            text = as_cpp(source.read_text("utf-8")) if on_device else source.read_text("utf-8")
             if number == 0:
                 text += f'\nSW_FACE({module.name}, "{module.source_hash()}")\n'
             (written := Path(scratch) / f"{number}.cpp").write_text(f'#line 1 "{source}"\n{text}', "utf-8")
@@ -75,9 +76,55 @@ def library_of(module: NativeModule) -> Path:
 def load(module: NativeModule, say: Any, *, ordinary: Callable[..., None]) -> None:
     """Stand for `NativeModule._load`."""
     if not module.cuda_sources:
-        return ordinary(module, say)
-    if (problem := module._open(library_of(module))) is not None:
+        ordinary(module, say)
+    elif (problem := module._open(library_of(module))) is not None:
         raise module._failure(problem)
+    else:
+        module._session.library = Recorded(module._session.library)
+
+
+class Recorded:
+    """A library whose calls a graph records."""
+
+    def __init__(self, library: Any) -> None:
+        self._library = library
+
+    def __getattr__(self, name: str) -> Any:
+        function = getattr(self._library, name)
+        if name.endswith("_last_error"):
+            return function
+
+        def call(reference: Any) -> int:
+            again = type(reference._obj).from_buffer_copy(reference._obj)
+            Graph.record(lambda: function(ctypes.byref(again)))
+            return function(reference)
+
+        return call
+
+
+class Graph:
+    """A graph of CUDA: what was recorded of the process, done anew; all memory stays with it."""
+
+    recording: Graph | None = None
+
+    def __init__(self) -> None:
+        self._calls: list[Callable[[], object]] = []
+
+    @classmethod
+    def record(cls, call: Callable[[], object]) -> None:
+        if cls.recording is not None:
+            cls.recording._calls.append(call)
+
+    def capture_begin(self, *args: Any, **kwargs: Any) -> None:
+        Graph.recording = self
+
+    def capture_end(self) -> None:
+        Graph.recording = None
+
+    @torch.no_grad()
+    def replay(self) -> None:
+        for call in self._calls:
+            call()
 
 
 class Places:
@@ -133,12 +180,33 @@ class Spreading(TorchDispatchMode):
     """Results of an operation are where its tensors are; new memory holds what nobody would want to compute with."""
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        found = func(*args, **(kwargs or {}))
+        given, kwargs = list(tensors_in(args)), kwargs or {}
+        on_gpu = any(map(PLACES.has, given))
+        if on_gpu and Graph.recording is not None and func is torch.ops.aten._local_scalar_dense.default:
+            raise RuntimeError("operation not permitted when stream is capturing")
+        found = func(*args, **kwargs)
         if func.overloadpacket.__name__ in EMPTY and found.numel():
             poison(found)
-        if PLACES.spread and any(map(PLACES.has, tensors_in(args))):
+        if PLACES.spread and on_gpu:
             PLACES.put(found)
+        if Graph.recording is not None and (on_gpu or not given):
+            Graph.record(functools.partial(repeat, func, args, kwargs, found, {storage_of(x) for x in given}))
         return found
+
+
+def storage_of(x: torch.Tensor) -> int:
+    return x.untyped_storage()._cdata
+
+
+def repeat(func: Any, args: Any, kwargs: Any, found: Any, given: set[int]) -> None:
+    """Do an operation again, with its results where they were."""
+    if func.overloadpacket.__name__ in EMPTY:
+        return poison(found)
+    again = func(*args, **kwargs)
+    for old, new in zip(tensors_in([found]), tensors_in([again]), strict=True):
+        if storage_of(old) not in given:  # else it is a view, or was written in place
+            old.copy_(new)
+    return None
 
 
 def poison(x: torch.Tensor) -> None:
@@ -219,7 +287,7 @@ class Generator(torch.Generator):
 class Nothing:
     """A stream, an event, a device of torch.cuda: nothing is to be waited for."""
 
-    cuda_stream = STREAM
+    cuda_stream, device_index = STREAM, 0
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         pass
@@ -254,14 +322,17 @@ def install() -> None:
         setattr(tensor, name, patched_method(getattr(tensor, name)))
     torch.Generator = Generator
     torch._C._cuda_getCurrentRawStream = lambda device: STREAM
+    torch.cuda.CUDAGraph = Graph
     torch.cuda.Stream = torch.cuda.Event = torch.cuda.device = torch.cuda.stream = Nothing
     told = {
         "is_available": True, "device_count": 1, "current_device": 0, "get_device_capability": (9, 0),
         "get_device_name": "CUDA on a CPU", "synchronize": None, "current_stream": Nothing(),
-        "is_current_stream_capturing": False, "empty_cache": None, "set_sync_debug_mode": None,
+        "is_current_stream_capturing": False, "graph_pool_handle": (0, 0), "empty_cache": None,
+        "set_sync_debug_mode": None,
         "get_sync_debug_mode": 0, "max_memory_allocated": 0, "memory_allocated": 0, "reset_peak_memory_stats": None,
         "max_memory_reserved": 0, "memory_reserved": 0, "mem_get_info": (1 << 36, 1 << 37), "_sleep": None,
-        "get_device_properties": SimpleNamespace(multi_processor_count=2, total_memory=1 << 37, name="CUDA on a CPU"),
+        "get_device_properties": SimpleNamespace(multi_processor_count=2, total_memory=1 << 37, name="CUDA on a CPU",
+            shared_memory_per_block_optin=232_448),
     }  # fmt: skip
     for name, value in told.items():
         setattr(torch.cuda, name, lambda *args, value=value, **kwargs: value)

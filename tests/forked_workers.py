@@ -27,11 +27,18 @@ DIGITS = 6
 """Of the number of a file, as workers take it from the pipe of those that nobody has taken."""
 
 
-def run_forked(session: pytest.Session, jobs: int, threads: int) -> None:
+def run_forked(session: pytest.Session, jobs: int, threads: int) -> bool:
     """Run what was collected in so many workers. Raises RuntimeError if one dies, `Failed` after `--maxfail`.
 
     threads     of torch in each worker; this process must have used one alone, or the workers would wait for its others
+
+    Returns False where nothing ran, since tests that need a GPU must run in this process: a forked one cannot use it.
     """
+    if needs_gpu(session.items):
+        torch.set_num_threads(threads)
+        os.environ.pop("TEST_JOBS", None)
+        print("\nthe tests run in one process: forked ones cannot use the GPU")
+        return False
     files = [list(items) for _, items in itertools.groupby(session.items, key=lambda item: item.path)]
     base = session.config._tmp_path_factory.getbasetemp()  # type: ignore[attr-defined]
     waiting, numbers = os.pipe()
@@ -61,6 +68,14 @@ def run_forked(session: pytest.Session, jobs: int, threads: int) -> None:
         finally:
             for pid in workers:
                 os.waitpid(pid, 0)
+    return True
+
+
+def needs_gpu(items: list[pytest.Item]) -> bool:
+    """Whether CUDA is set up here already, or a test among these uses a GPU that is there: both end with a fork."""
+    if torch.cuda.is_initialized():
+        return True
+    return any(item.get_closest_marker("cuda") for item in items) and torch.cuda.is_available()
 
 
 def _listen(file: BinaryIO, worker: int, told: queue.Queue[tuple[int, str, Any]]) -> None:

@@ -4,18 +4,19 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 from forked_children import run_python
+from forked_workers import needs_gpu
 
 CONFTEST = """
 import pytest
 from forked_workers import run_forked
 
 def pytest_runtestloop(session):
-    run_forked(session, 2, 1)
-    return True
+    return run_forked(session, 2, 1) or None
 
 @pytest.fixture(scope="session", autouse=True)
 def whole(tmp_path_factory):
@@ -52,6 +53,22 @@ def test_what_the_last_file_set_up_is_gone(tmp_path_factory):
     assert not (base / "ended").exists()
 """
 PYTEST = "import sys, pytest; sys.exit(pytest.main(sys.argv[1:]))"
+ON_GPU = """
+import os, pytest
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("i", range(2))
+def test_it_is_not_forked(i):
+    assert "TEST_WORKER" not in os.environ
+    assert "TEST_JOBS" not in os.environ
+"""
+HAS_GPU = """
+import torch
+torch.cuda.{} = lambda: True
+
+def pytest_configure(config):
+    config.addinivalue_line("markers", "cuda")
+"""
 DIES = "import os\ndef test_dies(): os._exit(0)\n"
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks on Linux alone")
@@ -80,6 +97,19 @@ def test_one_that_dies_fails_the_session_by_the_name_of_its_test(tmp_path):
     done = ran(tmp_path, test_a=DIES)
     assert done.returncode not in (0, 1, 5)
     assert "has ended in test_a.py::test_dies" in done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("told", ["is_available", "is_initialized"])
+def test_tests_that_use_a_gpu_run_in_one_process(tmp_path, told):
+    done = ran(tmp_path, conftest=CONFTEST + HAS_GPU.format(told), test_a=ON_GPU, test_b=ON_GPU)
+    assert "4 passed" in done.stdout, done.stdout + done.stderr
+    assert done.stdout.count("the tests run in one process: forked ones cannot use the GPU\n") == 1
+
+
+def test_without_a_test_for_it_a_gpu_is_no_reason(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert not needs_gpu([SimpleNamespace(get_closest_marker={"slow": True}.get)])
+    assert needs_gpu([SimpleNamespace(get_closest_marker={"cuda": True}.get)])
 
 
 def test_this_worker_has_its_share_of_the_cores():
