@@ -256,7 +256,7 @@ def patched_factory(ordinary: Any) -> Any:
 
     @functools.wraps(ordinary)
     def make(*args: Any, **kwargs: Any) -> Any:
-        device = kwargs.pop("device", None)
+        device, _ = kwargs.pop("device", None), kwargs.pop("pin_memory", None)
         if device is None or torch.device(device).type not in ("cpu", "cuda"):
             return ordinary(*args, **kwargs, **({} if device is None else {"device": device}))
         with PLACES.apart():
@@ -363,7 +363,8 @@ def patched_numpy(ordinary: Any) -> Any:
     return numpy
 
 
-install()
+def pytest_configure() -> None:
+    install()
 
 
 @pytest.hookimpl(wrapper=True)

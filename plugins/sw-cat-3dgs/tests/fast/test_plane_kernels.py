@@ -157,3 +157,14 @@ def test_planes_without_values_have_no_bits():
     (slope,) = torch.autograd.grad(bits, networks[0].layers[0].weight)
     assert float(bits) == 0
     assert not bool(slope.any())
+
+
+@pytest.mark.cuda
+@needs_gpu
+def test_lists_that_lack_a_scale_are_refused():
+    cells, weights = torch.zeros(5, 2, 3, 4, dtype=torch.int32, device="cuda"), torch.zeros(5, 2, 3, 4, device="cuda")
+    planes = [torch.zeros(3, 4, n, n, device="cuda") for n in (2, 3)]
+    with pytest.raises(RuntimeError, match="planes of 2 sizes and 4 channels do not fit"):
+        plane_kernels.sampled(cells, weights, planes[:1], 0.0)
+    with pytest.raises(RuntimeError, match="a tensor of scale 1 is missing"):
+        plane_kernels.sampled_backward(cells, weights, torch.zeros(5, 24, device="cuda"), planes[:1])

@@ -62,6 +62,13 @@ sw_triplane::Sites sites_of(const Call& call) {
   return {call.count, int(call.scales), int(call.channels), call.cells, call.weights};
 }
 
+// A list has a tensor for each scale that has places, and for all if there are sites.
+template <class Call, class Number>
+void check_all(const Call& call, Number* const (&list)[4]) {
+  for (int i = 0; i < int(call.scales); ++i)
+    if (list[i] == nullptr && (call.places[i] > 0 || call.count > 0)) refuse("a tensor of scale %d is missing", i);
+}
+
 bool in_fours(const sw_triplane::Sites& sites, const float* features) {
   return sites.channels % 4 == 0 && starts_at_multiple(features, 16);
 }
@@ -122,6 +129,7 @@ SW_OPERATION(sw_codecs_cuda, plane_bits) {
   return guarded_on_gpu(call, [&](cudaStream_t stream) {
     sw_planes::Planes at = planes_of(*call);
     for (int i = 0; i < at.scales; ++i) {
+      if (call->planes[i] == nullptr && at.orientations * at.count[i] > 0) refuse("planes of scale %d are missing", i);
       at.values[i] = call->planes[i], at.to[i] = call->to_planes[i], at.parts[i] = call->ordered[i];
       const int64_t needed = at.orientations * part_sums(at, i);
       if (at.parts[i] != nullptr && (at.to[i] == nullptr || call->ordered_counts[i] < needed))
@@ -136,6 +144,7 @@ SW_OPERATION(sw_codecs_cuda, plane_bits) {
 SW_OPERATION(sw_codecs_cuda, triplane_lookup) {
   return guarded_on_gpu(call, [&](cudaStream_t stream) {
     const sw_triplane::Sites sites = sites_of(*call);
+    check_all(*call, call->planes), check_all(*call, call->tables);
     sw_triplane::cuda::Tables tables{};
     for (int i = 0; i < sites.scales; ++i) {
       tables.of[i] = call->tables[i];
@@ -150,6 +159,8 @@ SW_OPERATION(sw_codecs_cuda, triplane_backward) {
   return guarded_on_gpu(call, [&](cudaStream_t stream) {
     const sw_triplane::Sites sites = sites_of(*call);
     const bool whole = call->largest != nullptr, four = in_fours(sites, call->slopes);
+    whole ? check_all(*call, call->sums) : check_all(*call, call->tables);
+    check_all(*call, call->to_planes);
     sw_triplane::cuda::Tables tables{};
     // A slope is that of its own scale and of all finer ones; corners may fall together.
     sw_triplane::cuda::SumTables sums{{}, call->largest, sites.count * sites.scales * sw_triplane::kCorners};
