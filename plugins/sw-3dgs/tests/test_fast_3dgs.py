@@ -161,10 +161,14 @@ def test_the_end_has_its_own_tasks_where_it_is_asked_for():
     assert "| sum views                   | range(8000, 10001)" in plan
 
 
-@pytest.mark.parametrize(("key", "value"), [("late_views", 8), ("average", 0.1)])
-def test_parts_of_an_end_that_does_not_come_are_refused(key, value):
-    with pytest.raises(ConfigError, match=f"fast.{key} would have no effect"):
-        stage_of(**{"fast__average": 0, f"fast__{key}": value}, scale_schedule=False, iterations=7_000)
+def test_late_views_of_an_end_that_does_not_come_are_refused():
+    with pytest.raises(ConfigError, match=r"fast\.late_views would have no effect"):
+        stage_of(fast__average=0, fast__late_views=8, scale_schedule=False, iterations=7_000)
+
+
+def test_a_run_that_ends_within_density_control_has_no_average():
+    pre, _ = build_schedulers(stage_of(fast__average=0.1, scale_schedule=False, iterations=7_000), PipelineParams())
+    assert "average parameters" not in {entry.name for entry in pre.registrations}
 
 
 def test_an_average_over_few_steps_has_two_samples():

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from sw_gaussians.quick import QUICK
+from sw_gaussians.quick import QUICK as LONGER
 
 from sw_codecs.models.rate_points import QUANTIZED_RATES
 
@@ -47,10 +47,34 @@ FAST_CPU: Mapping[str, Any] = {
     "density.settings.opacity": "reset",
     "pictures.schedule": "dash",
 }
-"""`fast` for two cores: few steps, the learning rates of `quick`, and few Gaussians.
+"""`fast` for two cores: few steps, the learning rates of the quick plan of 2,000 steps, few Gaussians.
 
 Two thirds of a step on a CPU are blending, which grows with pixels and Gaussians; hence small images at first
 (DashGaussian, arXiv 2503.18402). docs/methods/3dgs.md lists the effect of each part.
+"""
+
+QUICK: Mapping[str, Any] = {
+    **LONGER,
+    "iterations": 1_100,
+    "sh_interval": 80,
+    "lr.max_steps": 1_100,
+    "lr.position_init": 2.4e-3,
+    "lr.position_final": 2.4e-5,
+    "lr.sh_dc": 3e-2,
+    "lr.scales": 3e-2,
+    "lr.quats": 6e-3,
+    "lr.beta2": 0.98,
+    "density.settings.start": 110,
+    "density.settings.stop": 660,
+    "density.settings.interval": 55,
+    "density.settings.grad_threshold": 3e-4,
+    "fast.average": 0.1,
+    "pictures.schedule": "dash",
+}
+"""The quick plan of methods that train from points, in little more than half of its steps.
+
+Rates are larger, and Adam forgets squared gradients within fifty steps, not a thousand: of so short a run those of the
+first steps would be in force to its end. docs/methods/3dgs.md lists the effect of each part.
 """
 
 PRESETS: Mapping[str, Mapping[str, Any]] = {

@@ -49,6 +49,7 @@ class Distill(Params):
         0, ge=0, description="scene extent for which that is meant, it scales along; 0: it is in world units"
     )
     lr: FineTuningRates = Field(FineTuningRates(), description="step sizes")
+    beta2: float = Field(0.999, gt=0, lt=1, description="share of its squared gradients that Adam keeps per step")
 
 
 class Score(PrunerChoice):

@@ -93,7 +93,8 @@ class MaskedDistillation(DistillationStage):
 
     def create_optimizer(self, model: SplatModel, scene: Scene) -> SplatOptimizer:
         rates = {**self.rates.of_step(0, scene.extent), "mask_logits": self.config.mask.lr}
-        return SplatOptimizer(model, [ParamGroup(name, lr) for name, lr in rates.items()])
+        betas = 0.9, self.config.distill.beta2
+        return SplatOptimizer(model, [ParamGroup(name, lr, betas=betas) for name, lr in rates.items()])
 
     def create_sampler(self, scene: Scene, generator: torch.Generator) -> CameraSampler:
         meant_for = self.config.distill.pseudo_view_extent

@@ -25,6 +25,9 @@ class LearningRates(Params):
     opacity: float = Field(0.05, ge=0, description="of the opacity logits (authors' code of 2024: 0.025)")
     scales: float = Field(5e-3, ge=0, description="of the log scales")
     quats: float = Field(1e-3, ge=0, description="of the quaternions")
+    beta2: float = Field(
+        0.999, gt=0, lt=1, description="share of its squared gradients that Adam keeps per step; short runs want less"
+    )
 
 
 class Fast(Params):
@@ -42,11 +45,6 @@ class Fast(Params):
         lt=1,
         description="share of the run, at its end and after density control, whose mean the model becomes",
     )
-
-    @property
-    def late(self) -> list[str]:
-        """Enabled keys that act only after density control has ended."""
-        return [f"fast.{key}" for key, off in (("late_views", 1), ("average", 0)) if getattr(self, key) != off]
 
 
 class Loss(Params):

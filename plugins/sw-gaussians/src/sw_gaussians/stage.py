@@ -123,11 +123,11 @@ class ThreeDGSStage(Stage):
                         key="sparse_adam",
                     )
         end = opt.FULL_ITERATIONS if opt.scale_schedule else opt.iterations
-        if opt.fast.late and self.control.until >= end:
+        if opt.fast.late_views > 1 and self.control.until >= end:
             raise ConfigError(
-                f"{' and '.join(opt.fast.late)} would have no effect: density control goes on until step "
-                f"{self.control.until}, and the plan ends at {end}; leave it off, or set scale_schedule=true, more "
-                "iterations or a lower density.settings.stop"
+                f"fast.late_views would have no effect: density control goes on until step {self.control.until}, and "
+                f"the plan ends at {end}; leave it off, or set scale_schedule=true, more iterations or a lower "
+                "density.settings.stop"
             )
         self._options: RasterOptions | None = None  # of the last step: nearly always those of the next
         self._needs: frozenset[str] = frozenset()  # of these options
@@ -175,7 +175,8 @@ class ThreeDGSStage(Stage):
         }  # fmt: skip
         dense = SplatOptimizer if self.fuses_updates is False else FusingOptimizer
         adam = SparseSplatOptimizer if self.config.sparse_adam else dense
-        self._optimizer = adam(model, [ParamGroup(name, lr=rate) for name, rate in rates.items()])
+        betas = 0.9, lr.beta2
+        self._optimizer = adam(model, [ParamGroup(name, lr=rate, betas=betas) for name, rate in rates.items()])
         return self._optimizer
 
     def finish(self, model: SplatModel, scene: Scene) -> SplatModel:
