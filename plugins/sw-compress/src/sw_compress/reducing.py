@@ -88,6 +88,7 @@ class Reduction:
             # Of some that merged so little is left that nothing is drawn.
             merged, weights = merged_by(self.model, rows, count, self.weights()[rows], faintest=FAINTEST)
             if merged.sh_rest.untyped_storage().nbytes() > merged.sh_rest.nbytes:  # memory of all that merged
+                give_back()
                 merged.sh_rest.data = merged.sh_rest.clone()
             found = like(self.model, merged)
         else:
