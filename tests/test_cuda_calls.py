@@ -269,6 +269,12 @@ def test_rows_that_are_alike_are_checked_once(calls):
     for more in (rand(9, 3)[:, :2], rand(9, 3).double()):  # of another form: checked anew
         load.load(torch.arange(2), [more, rand(9, 6)], [rand(4, more.shape[1]).to(more.dtype), rand(4, 6)])
     assert [call.words[0] for call in calls["copy_rows"][6:]] == [2]  # eight bytes a number: by torch
+    wide = rand(9, 8)
+    for count in (1, 3):  # one row of five is contiguous, three with the same strides are not
+        load.load(torch.arange(count), [wide[:count, :5]], [rand(4, 5)])
+        assert list(calls["copy_rows"][-1].source_rows[:1]) == [5 if count == 1 else 8]
+    load = AlikeRows(Way.GATHER)
+    load.load(torch.arange(2), [rand(9, 3), rand(9, 6)], into)
     before = len(calls["copy_rows"])
     with pytest.raises((IndexError, RuntimeError)):
         load.load(torch.arange(5), [rand(9, 3), rand(9, 6)], into)

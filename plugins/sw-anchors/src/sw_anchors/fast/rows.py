@@ -162,7 +162,9 @@ class AlikeRows(threading.local):
         form = [looked_at[0].get_device(), *(x for t in looked_at for x in (t.dtype, t.stride()))]
         if form != self._form:
             fits = fit_kernels(*sources) and fit_kernels(*targets)
-            alike = fits and all(t.is_contiguous() for t in (*sources, *targets))
+            # Of one row any stride is contiguous, but of more with the same strides no more.
+            whole = (t.is_contiguous() and t.stride(0) == math.prod(t.shape[1:]) for t in (*sources, *targets))
+            alike = fits and all(whole)
             self._form, self._call = form, Repeated(cuda_face, "copy_rows") if alike else None
         count = rows.shape[0]
         if self._call is None or count > most:
