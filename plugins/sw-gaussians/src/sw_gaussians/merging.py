@@ -77,9 +77,9 @@ def splats_of(model: GaussianModel, rows: Tensor | None = None) -> Splats:
 
 def model_of(splats: Splats, rows: Tensor, like: GaussianModel) -> GaussianModel:
     """A model in float32 of some Gaussians, fixed, with what the file of `like` told; overwrites their SH."""
-    scales = splats.scales[rows].double().clamp(1e-38, 3e38)
     dc, rest = sh_of(splats.sh, rows)
-    raw = (splats.means[rows], dc, rest, logits_of(splats.opacities[rows]), scales.log(), splats.quats[rows])
+    log_scales = splats.scales[rows].double().clamp(1e-38, 3e38).log().float()
+    raw = (splats.means[rows], dc, rest, logits_of(splats.opacities[rows]), log_scales, splats.quats[rows])
     model = GaussianModel(*(values.float() for values in raw))
     model.origin = like.origin
     return model.eval().requires_grad_(False)
