@@ -77,7 +77,7 @@ ROWS = [
     Row("run --set itertions=3", "unknown key 'itertions' in --set: did you mean 'iterations'?"),
     Row("train --set densify.grad_treshold=1", "did you mean 'density.settings.grad_threshold'?"),
     Row("schedule 3dgs --set lr.opacty=1", "did you mean 'lr.opacity'?"),
-    Row("schedule 3dgs --set lr.xyzzy=1", "'lr' has max_steps, opacity, position_delay_mult"),
+    Row("schedule 3dgs --set lr.xyzzy=1", "'lr' has beta2, max_steps, opacity, position_delay_mult"),
     Row("info demo:tiny --set resolutoin=3", "did you mean 'resolution'?"),
     Row("run --set iterations", "--set needs key=value, got 'iterations'"),
     Row("run --set =3", "--set needs key=value, got '=3'"),
