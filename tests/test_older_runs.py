@@ -18,10 +18,6 @@ from splatwizard_core.runs.identity import recorded_hash
 from splatwizard_core.runs.record import read_record
 
 GOLDEN = Path(__file__).parent / "golden" / "runs_0_1"
-WHAT = [
-    "--method", "speedy-splat", "--scene", "demo:tiny", "--device", "cpu", "--set", "iterations=60",
-    "--set", "scale_schedule=true", "--set", "checkpoint_every=20", "--set", "threads=1",
-]  # fmt: skip
 
 
 @pytest.fixture
@@ -40,7 +36,7 @@ def test_a_finished_run_is_not_trained_again_and_gives_the_same_model(older, cap
     before = json.loads((directory / "metrics.json").read_text())
     known = recorded_hash(load_plugins(), read_record(directory / "metrics.json"))
     checkpoints = {path.name: path.read_bytes() for path in (directory / "checkpoints").iterdir()}
-    assert main(["run", *WHAT, "--out", str(out)]) == 0
+    assert main(["run", "--config", str(directory / "config.toml"), "--out", str(out)]) == 0
     assert "training speedy-splat" not in capsys.readouterr().err
     after = json.loads((directory / "metrics.json").read_text())
     assert {path.name: path.read_bytes() for path in (directory / "checkpoints").iterdir()} == checkpoints
@@ -76,7 +72,7 @@ def test_a_finished_run_is_measured_from_its_checkpoint(older, capsys):
 def test_a_stopped_training_goes_on_from_its_checkpoint(older):
     directory, out = older("interrupted")
     before = (directory / "log.jsonl").read_text().splitlines()
-    assert main(["train", *WHAT, "--out", str(out)]) == 0
+    assert main(["train", "--config", str(directory / "config.toml"), "--out", str(out)]) == 0
     after = (directory / "log.jsonl").read_text().splitlines()
     assert after[: len(before)] == before  # what was done is not done again
     assert json.loads(after[-1])["step"] == 60

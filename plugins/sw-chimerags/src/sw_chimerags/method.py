@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from sw_gaussians.older_keys import flattened
+from sw_gaussians.quick import LONGER
 from sw_gaussians.sized import fill
 
 from splatwizard_core.api import ConfigError, Method, create_method
@@ -19,6 +21,17 @@ if TYPE_CHECKING:
     import torch
 
     from splatwizard_core.api import ContainerReader, ContainerWriter, Scene, SplatModel, Stage
+
+OLDER_STOP = 1_900
+OLDER_QUICK: Mapping[str, Any] = {
+    "prune.start": 500,
+    "prune.interval": 500,
+    **{f"base.{key}": value for key, value in LONGER.items()},
+    "base.lr.max_steps": 2_500,
+    "base.density.settings.stop": 1_500,
+    "base.density.settings.grad_threshold": 3e-4,
+}
+"""Student of runs by the quick plan of 2,500 steps, whose removals ended at OLDER_STOP: they named the preset alone."""
 
 
 class ChimeraGS(Method):
@@ -53,6 +66,8 @@ class ChimeraGS(Method):
             values |= {f"prune.{key}": getattr(config.train, key) for key in ("soft", "hard", "stop")}
         values |= config.student
         preset = str(values.pop("preset", "paper"))
+        if preset == "quick" and name == "speedy-splat" and config.train.stop == OLDER_STOP:
+            values = {**OLDER_QUICK, **flattened(values)}
         return create_method(self.plugins, name, values, preset=preset)
 
     def borrows(self) -> Sequence[Method]:

@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from sw_gaussians.method import GaussianMethod
+from sw_gaussians.older_keys import flattened
+from sw_gaussians.quick import LONGER
 
 from splatwizard_core.api import Method, create_method
 from sw_speedy_splat.config import SpeedySplatConfig
@@ -30,8 +32,11 @@ class SpeedySplat(GaussianMethod):
 
     def _base(self) -> Method:
         """Return the configured 3DGS: its start and its stage."""
-        values = dict(self.config.base)
+        values = flattened(self.config.base)
         preset = str(values.pop("preset", "paper"))
+        # Runs by the quick plan of 2,500 steps named the preset of 3dgs, which has other values since.
+        if preset == "quick" and values.get("lr.max_steps") == 2_500 and "sh_interval" not in values:
+            values = {**LONGER, **values}
         length = {"iterations": self.config.iterations, "scale_schedule": self.config.scale_schedule}
         return create_method(self.plugins, "3dgs", {**length, **values}, preset=preset)
 

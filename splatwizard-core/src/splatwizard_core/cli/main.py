@@ -70,7 +70,7 @@ class LazyGroup(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         for option, number, unit in zip(args, args[1:], args[2:], strict=False):
-            if option in ("--size", "--bytes") and number[-1:].isdigit() and unit.lower() in ("kb", "mb", "gb", "mib"):
+            if option in ("--size", "--bytes") and number[-1:].isdigit() and unit[1:].lower() in ("b", "ib"):
                 raise click.UsageError(f"{option} {number} {unit} has a blank in it: write {number}{unit}", ctx)
         try:
             return super().resolve_command(ctx, args)

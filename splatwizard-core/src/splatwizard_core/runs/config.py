@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from splatwizard_core.method import Method
 
 RESERVED = ("method", "preset", "rate", "scene")
+OF_RUN = {*RESERVED, "seed", "threads", "log_every", "test_every"}  # all that a run writes, and hardly a person
 SCENE_KEYS = tuple(SceneParams.model_fields)
 PRETRAINED = "pretrained."  # keys of the method whose trained scene a run starts from
 USUAL_SOURCES = ("preset '", "data set '", "rate '")  # how the provenance of what the method itself says begins
@@ -248,8 +249,8 @@ def read_config_file(path: str | Path) -> dict[str, Any]:
 
 
 def is_whole(path: str | Path) -> bool:
-    """Whether a file is the config.toml of a run, which says everything: it names method, preset, rate and scene."""
-    return set(RESERVED) <= set(read_config_file(path))
+    """Whether a file is the config.toml of a run, which says everything."""
+    return set(read_config_file(path)) >= OF_RUN
 
 
 def parse_set(assignments: Sequence[str]) -> dict[str, str]:
@@ -288,7 +289,7 @@ def resolve(
     check_own_keys(method)
     plugins = plugins or load_plugins()
     tables = read_config_file(config_file) if config_file is not None else {}
-    said: dict[str, str] = {name: tables.pop(name) for name in RESERVED if name in tables}
+    whole, said = set(tables) >= OF_RUN, {name: tables.pop(name) for name in RESERVED if name in tables}
     _check_names(said, config_file, method=method.name, preset=preset, rate=rate, scene=scene)
     tables |= dotted({name: tables.pop(name) for name in TABLES if name in tables}, "")
     scene_spec = scene or said.get("scene") or plugins.datasets.default or ""
@@ -305,15 +306,14 @@ def resolve(
 
     family = family_of(scene_spec, plugins.datasets) if preset == "paper" and method.BY_DATASET else None
     config, ppl, reading = method.Config(), PipelineParams(), SceneParams()
-    init, pretrained, settings = "", dict[str, Any](), dict[str, Any]()
-    provenance: dict[str, str] = {}
+    init, provenance, pretrained, settings = "", dict[str, str](), dict[str, Any](), dict[str, Any]()
     for source, layer in (
         (f"{USUAL_SOURCES[0]}{preset}'", method.PRESETS[preset]),
         (f"{USUAL_SOURCES[1]}{family}'", method.BY_DATASET.get(family or "", {})),
         (f"{USUAL_SOURCES[2]}{rate}'", method.RATES[rate]),
         (str(config_file), flatten(method.Config, flatten(PipelineParams, tables))),
         ("--set", sets or {}),
-    ):
+    )[3 * whole :]:  # what the file of a run lacks is newer, and has its default: the presets of then meant that
         given_keys, layer = dict(layer), config.spelled(layer)
         if source == "--set" or source == str(config_file):
             _tell_older(method.Config, given_keys, layer, source)
