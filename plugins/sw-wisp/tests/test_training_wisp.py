@@ -159,6 +159,15 @@ def test_without_a_cap_as_many_begin_as_the_pixels_ask_for():
     assert len(kept_rows(Worth(costs, costs, 1.0), views_of(4, 4, 10), WispConfig())) == 100
 
 
+def test_a_run_from_before_the_density_goes_on_without_one(tmp_path):
+    written, file = resolve(Wisp, "paper", scene="mipnerf360/garden").toml(), tmp_path / "config.toml"
+    assert "density = 0.006\n" in written
+    file.write_text(written.replace("density = 0.006\n", ""))
+    assert resolve(Wisp, config_file=file).config.budget.density == 1
+    file.write_text('preset = "paper"\nscene = "mipnerf360/garden"\n')  # of a user
+    assert resolve(Wisp, config_file=file).config.budget.density == 0.006
+
+
 def test_photographs_begin_with_few_splats_per_pixel():
     config = resolve(Wisp, "paper", scene="mipnerf360/garden").config
     costs = torch.linspace(1, 2, 900, dtype=torch.float64)
