@@ -78,8 +78,9 @@ def ran(folder: Path, **files: str) -> subprocess.CompletedProcess[str]:
     for name, text in {"conftest": CONFTEST, **files}.items():
         (folder / f"{name}.py").write_text(text)
     command = ["-c", PYTEST, "-p", "no:cacheprovider", f"--basetemp={folder / 'base'}"]
+    outside = {name: value for name, value in os.environ.items() if name != "TEST_WORKER"}
     paths = os.pathsep.join(filter(None, [str(Path(__file__).parent), os.environ.get("PYTHONPATH")]))
-    return run_python(*command, cwd=folder, env={**os.environ, "PYTHONPATH": paths, "TEST_JOBS": "2"})
+    return run_python(*command, cwd=folder, env={**outside, "PYTHONPATH": paths, "TEST_JOBS": "2"})
 
 
 def test_their_findings_are_reported_in_one_process(tmp_path):

@@ -202,7 +202,7 @@ def test_a_probe_measures_the_first_steps_and_writes_nothing(tmp_path, capsys):
     estimates = Estimates()
     probe_into(estimates, jobs)
     told = capsys.readouterr().err
-    assert "3dgs (training) on demo:tiny: 2,000 steps of " in told
+    assert "3dgs (training) on demo:tiny: 1,100 steps of " in told
     assert "lightgaussian on demo:tiny: " in told
     by_name = {job.about[0]: estimates.of(job) for job in jobs}
     assert by_name["3dgs"] == 0.0  # its training is that of the others
