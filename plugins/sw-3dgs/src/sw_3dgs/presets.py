@@ -33,13 +33,14 @@ sw-3dgs lists the effect of each part.
 
 FAST_CPU: Mapping[str, Any] = {
     **FAST,
-    "iterations": 2_400,
-    "lr.position_init": 8e-4,
-    "lr.sh_dc": 1e-2,
-    "lr.sh_rest": 1e-3,
+    "iterations": 1_400,
+    "lr.position_init": 2.4e-3,
+    "lr.sh_dc": 3e-2,
+    "lr.sh_rest": 3e-3,
     "lr.opacity": 0.05,
-    "lr.scales": 1e-2,
-    "lr.quats": 2e-3,
+    "lr.scales": 3e-2,
+    "lr.quats": 6e-3,
+    "lr.beta2": 0.98,
     "density.settings.stop": 18_000,
     "density.settings.interval": 750,
     "density.settings.reset_interval": 30_000,  # never: a short run does not recover from what a long one gains by
@@ -47,7 +48,7 @@ FAST_CPU: Mapping[str, Any] = {
     "density.settings.opacity": "reset",
     "pictures.schedule": "dash",
 }
-"""`fast` for two cores: few steps, the learning rates of the quick plan of 2,000 steps, few Gaussians.
+"""`fast` for two cores: few steps, the learning rates of `quick`, few Gaussians.
 
 Two thirds of a step on a CPU are blending, which grows with pixels and Gaussians; hence small images at first
 (DashGaussian, arXiv 2503.18402). docs/methods/3dgs.md lists the effect of each part.
