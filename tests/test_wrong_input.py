@@ -120,6 +120,7 @@ ROWS = [
     Row("decode {grey.swz} --hash --out {new}.ply", "leave out --out and --json"),
     Row("compress {grey.swz} --size much --out {new}.swz", "'much' is no size"),
     Row("compress {grey.swz} --size 300 kB --out {new}.swz", "has a blank in it: write 300kB"),
+    Row("compress {grey.swz} --size 300 KiB --out {new}.swz", "has a blank in it: write 300KiB"),
     Row("run --scene demo:tiny --size 5 MB", "has a blank in it: write 5MB"),
     Row("lod {grey.swz} --out {new}.swz --levels 3", "--levels"),
     Row("lod {cut.ply} --out {new}/lod-meta.json", "cut.ply"),
