@@ -48,9 +48,13 @@ STARTED = (
 SINCE: dict[tuple[str, str], dict[str, Any]] = {
     ("lightgaussian", "paper"): {"prune.settings.kind": PIXELS, "score.settings.kind": PIXELS},
     ("3dgs", "quick"): LONGER,
+    ("3dgs", "fast-cpu"): {
+        "iterations": 2_400, "lr.position_init": 8e-4, "lr.sh_dc": 1e-2, "lr.sh_rest": 1e-3, "lr.scales": 1e-2,
+        "lr.quats": 2e-3, "lr.beta2": 0.999,
+    },
     ("speedy-splat", "quick"): SPEEDY,
     **{(name, "quick"): {f"pretrained.{key}": value for key, value in LONGER.items()} for name in STARTED},
-}
+}  # fmt: skip
 SINCE["chimerags", "quick"] |= CHIMERA
 """Values of then in presets that have others since."""
 
