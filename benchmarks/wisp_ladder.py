@@ -34,6 +34,8 @@ from rich.console import Console
 from rich.table import Table
 from sweep_cells import Cell, add_options, chosen, print_outcomes, run_cells
 
+from sw_wisp.presets import GROWN, PHOTOGRAPHS
+
 RATES = ("r1", "r2", "r3", "r4", "r5")
 COLUMNS = ("PSNR dB", "of training views", "SSIM", "bytes", "splats", "train s", "encode s", "decode s")
 BASELINES = {"hac-plus": (0.50, ("r1", "r3", "r5")), "cat-3dgs": (0.75, ("r1", "r3", "r6"))}
@@ -41,12 +43,9 @@ BASELINES = {"hac-plus": (0.50, ("r1", "r3", "r5")), "cat-3dgs": (0.75, ("r1", "
 FAMILIES: Mapping[str, Sequence[str]] = {
     "wisp": [],
     "progressive": ["layers.progressive=true", "layers.train=0.25"],
-    "mcmc": [
-        "pretrained.preset=mcmc", "pretrained.iterations=12000", "pretrained.scale_schedule=true",
-        "pretrained.density.settings.cap=none", "budget.density=1",
-    ],
-    "fast": ["pretrained.preset=fast", "budget.density=0.006"],
-}  # fmt: skip
+    "mcmc": [f"{key}={value}".lower() for key, value in GROWN.items()],
+    "fast": [f"{key}={value}" for key, value in PHOTOGRAPHS.items()],
+}
 """Family -> its values."""
 SLOW = {"means": (1.6e-6, 1.6e-7), "shape": (1.3e-3, 1.3e-4), "opacity": (8e-3, 8e-4), "colour": (8e-4, 8e-5)}
 RUNGS: Mapping[str, Sequence[str]] = {

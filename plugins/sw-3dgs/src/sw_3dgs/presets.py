@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from sw_gaussians.quick import QUICK as LONGER
+from sw_gaussians.quick import QUICK as FROM_POINTS
 
 from sw_codecs.models.rate_points import QUANTIZED_RATES
 
@@ -55,7 +55,7 @@ Two thirds of a step on a CPU are blending, which grows with pixels and Gaussian
 """
 
 QUICK: Mapping[str, Any] = {
-    **LONGER,
+    **FROM_POINTS,
     "iterations": 1_100,
     "sh_interval": 80,
     "lr.max_steps": 1_100,

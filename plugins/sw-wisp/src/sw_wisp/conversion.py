@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
-from sw_gaussians.density.mcmc import cap_for
+from sw_gaussians.density.mcmc import cap_for, pixels_of
 from torch import Tensor
 
 from splatwizard_core.api import GaussianModel
@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from splatwizard_core.api import Rasterizer, View
     from sw_wisp.config import WispConfig
 
-HEAD_ROOM = 1.5
-"""Splats that may begin, in caps: removal takes the rest while it trains."""
+HEAD_ROOM = 1.5  # splats that may begin, in caps: removal takes the rest while it trains
 FAR_SHARE = 1e-4
 """Of the worth of all splats: what may lie beyond the root cube, and goes. MCMC throws some splats a thousand rooms
 away, where nobody sees them, and cells are a 2^18th of the cube at the finest."""
@@ -36,8 +35,7 @@ looks the same."""
 def kept_rows(worth: Worth, views: Sequence[View], config: WispConfig) -> Tensor:
     """Return the rows [M] int64, ascending, that begin: the worthiest that the cap lets, less a number that do harm."""
     n = len(worth.change)
-    pixels = sum(view.camera.width * view.camera.height for view in views)
-    most = config.budget.cap or min(cap_for(views), config.budget.density * pixels)
+    most = config.budget.cap or min(cap_for(views), config.budget.density * pixels_of(views))
     cap = round(HEAD_ROOM * most * config.budget.cap_factor)
     needless = min(int((worth.cost <= 0).sum()), int(config.budget.worthless * n))
     keep = max(1, min(n - needless, cap))

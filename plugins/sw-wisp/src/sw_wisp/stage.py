@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 import torch
+from sw_gaussians.density.mcmc import pixels_of
 from sw_gaussians.removal import removal_costs
 from torch import Tensor
 
@@ -437,7 +438,7 @@ class WispStage(Stage):
 
 def priced_pixels(views: Sequence[View]) -> float:
     """Return the pixels that bits are paid by: of all training pictures over 100; lambda is that of a hundred."""
-    return sum(view.camera.width * view.camera.height for view in views) / 100
+    return pixels_of(views) / 100
 
 
 def some_views(views: list[View], draws: torch.Generator) -> list[View]:

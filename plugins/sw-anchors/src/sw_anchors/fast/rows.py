@@ -25,7 +25,7 @@ from sw_codecs.quantizers.straight_through import hard_mask
 MAX_TENSORS = 12
 """Largest number of tensors per launch: `kTensors` of kernels/rows.h."""
 GIVEN = ("features", "log_scales", "offsets", "logits", "weights", "valid", "noise", "steps")
-"""What both operations of noisy rows read, as kernels/cuda/face.h names it."""
+"""Arguments that both operations of noisy rows read, as kernels/cuda/face.h names them."""
 
 
 def fit_kernels(*tensors: Tensor) -> bool:

@@ -22,10 +22,8 @@ if TYPE_CHECKING:
     from splatwizard_core.api import RenderResult, StageContext, TrainingState, View
     from splatwizard_core.training.density import DensityReport, DensityTask
 
-MAX_COPIES = 51
-"""Largest number of copies per Gaussian in the relocation formula (size of the binomial table in the paper's code)."""
-STEEPNESS = 100.0
-"""Steepness of the logistic that turns the noise off as a Gaussian becomes opaque."""
+MAX_COPIES = 51  # most copies per Gaussian in the relocation formula (size of the binomial table in the paper's code)
+STEEPNESS = 100.0  # of the logistic that turns the noise off as a Gaussian becomes opaque
 
 
 class MCMCSettings(Params):
@@ -119,7 +117,12 @@ class MCMC(DensityControl):
 
 def cap_for(views: Sequence[View]) -> int:
     """Return how many Gaussians are enough for training views: 250,000 for a hundred of 800x800."""
-    return round(31.25 * math.sqrt(sum(view.camera.width * view.camera.height for view in views)))
+    return round(31.25 * math.sqrt(pixels_of(views)))
+
+
+def pixels_of(views: Sequence[View]) -> int:
+    """Return how many pixels the pictures of views have together."""
+    return sum(view.camera.width * view.camera.height for view in views)
 
 
 def gaussians_of(state: TrainingState) -> GaussianModel:
