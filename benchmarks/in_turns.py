@@ -114,23 +114,25 @@ def train_in_slices() -> None:
     """Run `sw` in this process; halt after so many steps of the first stage, and end where that does."""
     from splatwizard_core.training.trainer import Trainer
 
-    run, run_step = Trainer.run, Trainer.run_step
+    named = "run_step" if hasattr(Trainer, "run_step") else "_run_step"  # as it was in 0.2
+    run, run_step = Trainer.run, getattr(Trainer, named)
     skip, taken = int(os.environ[SKIP]), 0
     with open(os.environ[STEPS], "r+b") as file:
         counter = mmap.mmap(file.fileno(), 8)
 
-    def run_and_count(trainer: Any) -> None:
+    def run_and_count(trainer: Any, *args: Any, **kwargs: Any) -> Any:
         nonlocal taken
         if taken == skip:
             _wait_for_gpu()
             os.kill(os.getpid(), signal.SIGSTOP)
-        run_step(trainer)
+        found = run_step(trainer, *args, **kwargs)
         taken += 1
         struct.pack_into("q", counter, 0, taken)
+        return found
 
     def run_to_the_end(trainer: Any, *args: Any, **kwargs: Any) -> None:
         run(trainer, *args, **kwargs)
-        state = getattr(trainer, "state", trainer)  # before 0.3 the trainer had it all
+        state = getattr(trainer, "state", None) or trainer  # before 0.3 the trainer had it all
         if state.step < state.stage.iterations and not state.stopped:
             return
         _wait_for_gpu()
@@ -138,7 +140,8 @@ def train_in_slices() -> None:
         os.write(int(os.environ[REPORT]), json.dumps(end).encode())
         os._exit(0)  # no checkpoint is written while another version trains
 
-    Trainer.run, Trainer.run_step = run_to_the_end, run_and_count  # type: ignore[method-assign]
+    Trainer.run = run_to_the_end  # type: ignore[method-assign]
+    setattr(Trainer, named, run_and_count)
     runpy.run_module("splatwizard_core", run_name="__main__", alter_sys=True)
 
 

@@ -26,9 +26,10 @@ RUNS = {
         "sw-anchors/tests/fast/test_row_kernels.py", "sw-anchors/tests/fast/test_network_kernel.py",
         "not 20000 and not 8449 and not each_time",
     ),
+    "training": ("../splatwizard-core/tests/training/test_training_cuda.py", ""),
 }  # fmt: skip
 """Folders and files of tests below plugins/, then the small ones of their tests."""
-LEAST = {"hac": 60, "codecs": 22, "planes": 20, "anchors": 12}
+LEAST = {"hac": 60, "codecs": 22, "planes": 20, "anchors": 12, "training": 12}
 """How many of them there are, at least."""
 
 pytestmark = pytest.mark.slow

@@ -161,7 +161,7 @@ def test_an_object_of_one_cuda_compiler_or_of_its_flags_is_not_taken_for_that_of
 def test_a_distributed_cuda_library_is_used_without_a_cuda_compiler_if_it_fits_the_gpu(
     package, monkeypatch, tmp_path, cuda, other
 ):
-    """It lies in the distribution for the CUDA of torch; one of another version of the sources has another name."""
+    """It was made for torch's CUDA or an older one; one of another version of the sources has another name."""
     import torch
 
     package.write("face.h", GPU_FACE)
@@ -192,6 +192,8 @@ def test_a_distributed_cuda_library_is_used_without_a_cuda_compiler_if_it_fits_t
         assert (module.available() is None) == suits
     assert module.state()["state"] == "prebuilt"
     monkeypatch.setattr(torch.version, "cuda", other)
+    assert (library in module._existing()) == (other > cuda)
+    monkeypatch.setattr(torch.version, "cuda", None)
     assert not list(module._existing())
     monkeypatch.setattr(torch.version, "cuda", cuda)
     package.write("fill.cu", CUDA_KERNEL + "// changed\n")

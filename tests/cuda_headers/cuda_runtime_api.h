@@ -245,6 +245,19 @@ cudaError_t cudaFuncSetAttribute(Kernel* kernel, cudaFuncAttribute, int value) {
 
 #ifdef __CUDACC__
 
+inline void __threadfence() {}  // blocks run one after the other
+template <class Value>
+Value __ldcg(const Value* place) {
+  return *place;
+}
+template <class Value>
+Value __ldcs(const Value* place) {
+  return *place;
+}
+template <class Value>
+void __stcs(Value* place, Value value) {
+  *place = value;
+}
 inline void __syncthreads() { cuda_on_cpu::of_block(0); }
 inline int __syncthreads_count(int own) { return cuda_on_cpu::of_block(own != 0); }
 inline int __syncthreads_or(int own) { return cuda_on_cpu::of_block(own != 0) != 0; }

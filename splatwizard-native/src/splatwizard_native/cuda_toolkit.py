@@ -43,11 +43,12 @@ def root_of(nvcc: str) -> Path:
 
 
 def distributed() -> list[Path]:
-    """Folders of the libraries that `splatwizard-cudaN` brings, N the major version of torch's CUDA; or none."""
+    """Folders of libraries of `splatwizard-cudaN`: for torch's CUDA, then for older ones, which a driver runs, too."""
     import torch
 
-    spec = importlib.util.find_spec(f"splatwizard_cuda{(torch.version.cuda or '').partition('.')[0]}")
-    return [Path(folder) / "prebuilt" for folder in (spec and spec.submodule_search_locations) or ()]
+    newest = int((torch.version.cuda or "0").partition(".")[0])
+    specs = [importlib.util.find_spec(f"splatwizard_cuda{major}") for major in range(newest, 11, -1)]
+    return [Path(folder) / "prebuilt" for spec in specs for folder in (spec and spec.submodule_search_locations) or ()]
 
 
 def toolkit_mismatch() -> str | None:

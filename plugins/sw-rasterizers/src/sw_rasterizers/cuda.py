@@ -88,7 +88,7 @@ Again = dict[str, Repeated]
 
 def again() -> Again:
     """Return what a first drawing fills for those that are like it."""
-    return {name: Repeated(cuda_face, name) for name in ("render", "blend_backward", "project_backward")}
+    return {name: Repeated(cuda_face, name) for name in ("render", "blend_backward")}
 
 
 def draw(picture: Picture, tensors: Tensors, again: Again | None = None) -> Drawn:
@@ -220,11 +220,15 @@ def project_backward(
         more = {"geom_indices": call.geom_indices, "visible": call.visible, "color_channels": picture.colors}
         unwanted = {"channels", "background", "backdrop"}
         settings = {name: x for name, x in picture.settings().items() if name not in unwanted}
-        return {**settings, **more, **_adam("dc", done.get("sh_dc")), **_adam("rest", done.get("sh_rest"))}
+        return {**settings, **more}
 
-    found = (_once(cuda_face.project_backward) if again is None or done else again["project_backward"])(
+    operation = _once(cuda_face.project_backward)
+    if again is not None:  # with other updates, other fields are set
+        operation = again.setdefault(" ".join(("of", *done)), Repeated(cuda_face, "project_backward"))
+    found = operation(
         fixed, **_rows(means.shape[0], again), **{name: x for name, x in tensors.items() if x is not None},
         camera=tuple(call.camera), drawn=drawn, rows=rows, maps=maps,
+        **_adam("dc", done.get("sh_dc")), **_adam("rest", done.get("sh_rest")),
         **{f"of_{name}": x.data_ptr() for name, x in made.items()},
     )  # fmt: skip
     # Whoever offered an update sees by the version that it is done: of what was drawn, since the update may name an
@@ -278,10 +282,8 @@ def _at(tensor: Tensor | None) -> int | None:
 def _adam(name: str, u: AdamUpdate | None) -> dict[str, Any]:
     """Moments and rates of an update, as project_backward names them."""
     if u is None:
-        return {f"{name}_rates": [0.0] * 6}
-    rates = [
-        u.lr / (1 - u.beta1**u.step), 1 - u.beta1, u.beta2, 1 - u.beta2, (1 - u.beta2**u.step) ** -0.5, u.eps,
-    ]  # fmt: skip
+        return {f"{name}_rates": (0.0,) * 6}
+    rates = u.lr / (1 - u.beta1**u.step), 1 - u.beta1, u.beta2, 1 - u.beta2, (1 - u.beta2**u.step) ** -0.5, u.eps
     return {f"{name}_exp_avg": u.exp_avg, f"{name}_exp_avg_sq": u.exp_avg_sq, f"{name}_rates": rates}
 
 

@@ -8,14 +8,7 @@ from pydantic import Field
 
 from splatwizard_core.base.block import Block, MemoryKind
 from splatwizard_core.evaluation.speed import SpeedBlock
-from splatwizard_core.runs.record import (
-    DecodeFigures,
-    MemoryBlock,
-    PhaseBlock,
-    PretrainingBlock,
-    Quality,
-    TrainBlock,
-)
+from splatwizard_core.runs.record import DecodeFigures, MemoryBlock, PhaseBlock, PretrainingBlock, Quality, TrainBlock
 from splatwizard_core.training.measurements import Provided, StagePlan
 from splatwizard_native import CoreTime
 

@@ -11,12 +11,15 @@ from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from splatwizard_native.fused import cuda_face, face
 from splatwizard_native.fused.native import TRAINING
+from splatwizard_native.repeated import Repeated
 
 Padding = Literal["same", "valid"]
 
 TILE = 32  # pixels of a block of the CUDA kernel, each way
 RADIUS, SIGMA = 5, 1.5  # 11 x 11 window
 C1, C2 = 0.01**2, 0.03**2
+
+_LOSS = Repeated(cuda_face, "photometric_loss")
 
 
 def photometric(
@@ -49,16 +52,13 @@ def photometric_gradient(
     weights = dict[str, Any](valid=padding == "valid", l1_weight=1.0 - lambda_dssim, ssim_weight=-lambda_dssim)
     grad = torch.empty_like(x) if learns else None
     if x.is_cuda:  # no number is waited for
-        total, l1, similarity = (x.new_empty(()) for _ in range(3))
-        slopes = x.new_empty(3, *x.shape) if learns else None
-        sums = x.new_empty(2 + 2 * planes * -(-height // TILE) * -(-width // TILE))
-        cuda_face.photometric_loss(  # addresses of what is made here, which fits, spare its checks
-            x=x, y=y, **weights, offset=lambda_dssim, total=total.data_ptr(), l1=l1.data_ptr(),
-            ssim=similarity.data_ptr(), slopes=None if slopes is None else slopes.data_ptr(), sums=sums.data_ptr(),
-            sum_count=sums.numel(),
-        )  # fmt: skip
-        if grad is not None and slopes is not None:
-            cuda_face.photometric_loss_backward(x=x, y=y, slopes=slopes, **weights, grad=grad.data_ptr())
+        found = x.new_empty(3)
+        sums = 2 + 2 * planes * -(-height // TILE) * -(-width // TILE)
+        scratch = x.new_empty(sums + (3 * x.numel() if learns else 0))
+        form = x.shape, y.shape, y.dtype, x.get_device(), y.get_device(), lambda_dssim, padding, learns
+        more = {"found": found, "grad": grad, "scratch": scratch, "scratch_count": scratch.numel()}
+        _LOSS(lambda: {**weights, "offset": lambda_dssim}, form, x=x, y=y, **more)
+        total, l1, similarity = found.unbind()
     else:
         told = face.photometric(x=x, y=y, **weights, grad=grad, row_sums=x.new_empty(2, planes, height).double())
         whole = lambda_dssim + weights["l1_weight"] * told.l1 + weights["ssim_weight"] * told.ssim

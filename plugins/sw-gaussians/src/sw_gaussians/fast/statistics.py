@@ -6,8 +6,11 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.api import GaussianModel
+from splatwizard_native import Repeated
 from sw_gaussians import cuda_face
 from sw_gaussians.native import GAUSSIANS
+
+_VIEW = Repeated(cuda_face, "view_statistics")
 
 
 def accumulate(model: GaussianModel, gradients: Tensor, radii: Tensor) -> bool:
@@ -15,9 +18,12 @@ def accumulate(model: GaussianModel, gradients: Tensor, radii: Tensor) -> bool:
     sums = model.grad_accum, model.denom, model.max_radii2d
     fits = _fits_kernel(gradients, radii, sums) and GAUSSIANS.has_cuda()
     if fits:
-        cuda_face.view_statistics(
-            gradients=gradients, radii=radii, grad_accum=sums[0], denom=sums[1], max_radii=sums[2]
-        )
+        rows, tensors = radii.shape[0], (gradients, radii, *sums)
+        form = gradients.dim(), *((t.shape[0] == rows, t.get_device()) for t in tensors)
+        _VIEW(
+            dict, form, gradients=gradients, radii=radii, rows=rows, grad_accum=sums[0], denom=sums[1],
+            max_radii=sums[2],
+        )  # fmt: skip
     return fits
 
 

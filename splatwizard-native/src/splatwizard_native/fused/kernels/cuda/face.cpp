@@ -13,8 +13,7 @@ namespace kernels = splatwizard::cuda;
 
 namespace {
 
-template <class Call>
-kernels::Photometric photometric_of(const Call& call) {
+kernels::Photometric photometric_of(const photometric_loss_call& call) {
   const int64_t lost = call.valid ? 10 : 0, most = std::numeric_limits<int>::max();
   if (call.planes < 1 || call.height <= lost || call.width <= lost)
     refuse("the image of %lld x %lld is too small", (long long)call.height, (long long)call.width);
@@ -23,7 +22,7 @@ kernels::Photometric photometric_of(const Call& call) {
     refuse("%lld images of %lld x %lld are too large", (long long)call.planes, (long long)call.height,
            (long long)call.width);
   return {call.x, call.y, int(call.planes), int(call.height), int(call.width), call.valid, call.l1_weight,
-          call.ssim_weight, 0., nullptr};
+          call.ssim_weight, call.offset, nullptr};
 }
 
 }  // namespace
@@ -31,21 +30,16 @@ kernels::Photometric photometric_of(const Call& call) {
 SW_OPERATION(splatwizard_training_cuda, photometric_loss) {
   return guarded_on_gpu(call, [&](cudaStream_t stream) {
     kernels::Photometric args = photometric_of(*call);
-    args.offset = call->offset, args.slopes = call->slopes;
-    const int64_t needed = 2 + 2 * kernels::photometric_blocks(args);
-    if (call->sum_count < needed) refuse("sums has %lld numbers, not %lld", (long long)call->sum_count, (long long)needed);
-    splatwizard::check(cudaMemsetAsync(call->sums, 0, sizeof(float2), stream));
-    auto* const places = reinterpret_cast<float2*>(call->sums);
-    kernels::photometric(args, {reinterpret_cast<unsigned*>(places), places + 1}, {call->total, call->l1, call->ssim},
-                         stream);
-  });
-}
-
-SW_OPERATION(splatwizard_training_cuda, photometric_loss_backward) {
-  return guarded_on_gpu(call, [&](cudaStream_t stream) {
-    kernels::Photometric args = photometric_of(*call);
-    args.slopes = const_cast<float*>(call->slopes);
-    kernels::photometric_backward(args, call->scale, call->grad, stream);
+    const int64_t sums = 2 + 2 * kernels::photometric_blocks(args);
+    const int64_t slopes = call->grad ? 3 * call->planes * call->height * call->width : 0;
+    if (call->scratch_count < sums + slopes)
+      refuse("scratch has %lld numbers, not %lld", (long long)call->scratch_count, (long long)(sums + slopes));
+    if (call->grad) args.slopes = call->scratch + sums;
+    splatwizard::check(cudaMemsetAsync(call->scratch, 0, sizeof(float2), stream));
+    auto* const places = reinterpret_cast<float2*>(call->scratch);
+    float* const found = call->found;
+    kernels::photometric(args, {reinterpret_cast<unsigned*>(places), places + 1}, {found, found + 1, found + 2}, stream);
+    if (call->grad) kernels::photometric_backward(args, call->grad, stream);
   });
 }
 

@@ -29,8 +29,8 @@ struct PhotometricMeans {  // one number each
 };
 void photometric(const Photometric& args, const PhotometricSums& sums, const PhotometricMeans& means,
                  cudaStream_t stream);
-// grad [planes, height, width] = *scale d total / d x, from the slopes; scale null: 1.
-void photometric_backward(const Photometric& args, const float* scale, float* grad, cudaStream_t stream);
+// grad [planes, height, width] = d total / d x, from the slopes.
+void photometric_backward(const Photometric& args, float* grad, cudaStream_t stream);
 
 struct AdamTensor {
   float* param;

@@ -173,7 +173,7 @@ __global__ void __launch_bounds__(kThreads)
 }
 
 __global__ void __launch_bounds__(kThreads)
-    backward_kernel(Photometric a, const float* scale, float* grad, float l1_scale) {
+    backward_kernel(Photometric a, float* grad, float l1_scale) {
   __shared__ __align__(16) float tile[kHalo][kPitch];
   __shared__ __align__(16) float blurred[3][kHalo][kTile];
   const Place at = place(a);
@@ -194,7 +194,6 @@ __global__ void __launch_bounds__(kThreads)
   float sums[3][kRows];
 #pragma unroll
   for (int k = 0; k < 3; ++k) blur_column(blurred[k], first_row, column, sums[k]);
-  const float factor = scale == nullptr ? 1.f : *scale;
 #pragma unroll
   for (int j = 0; j < kRows; ++j) {
     const int y = at.y0 + first_row + j;
@@ -202,7 +201,7 @@ __global__ void __launch_bounds__(kThreads)
     const int64_t i = at.plane + int64_t(y) * a.width + x;
     const float of_x = a.x[i], of_y = a.y[i], difference = of_x - of_y;
     const float sign = difference > 0.f ? l1_scale : (difference < 0.f ? -l1_scale : 0.f);
-    grad[i] = factor * (sign + sums[0][j] + 2.f * of_x * sums[1][j] + of_y * sums[2][j]);
+    grad[i] = sign + sums[0][j] + 2.f * of_x * sums[1][j] + of_y * sums[2][j];
   }
 }
 
@@ -227,8 +226,8 @@ void photometric(const Photometric& args, const PhotometricSums& sums, const Pho
   forward_kernel<<<grid(args), kThreads, 0, stream>>>(args, sums, means, float(args.ssim_weight / counted));
 }
 
-void photometric_backward(const Photometric& args, const float* scale, float* grad, cudaStream_t stream) {
-  backward_kernel<<<grid(args), kThreads, 0, stream>>>(args, scale, grad, l1_scale(args));
+void photometric_backward(const Photometric& args, float* grad, cudaStream_t stream) {
+  backward_kernel<<<grid(args), kThreads, 0, stream>>>(args, grad, l1_scale(args));
 }
 
 }  // namespace splatwizard::cuda
