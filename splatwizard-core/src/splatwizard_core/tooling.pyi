@@ -108,6 +108,7 @@ from splatwizard_core.scene.loading import load_scene as load_scene
 from splatwizard_core.scene.locate import DATA_VARIABLE as DATA_VARIABLE
 from splatwizard_core.streams import Streams as Streams
 from splatwizard_core.training.keys import block_keys as block_keys
+from splatwizard_core.training.keys import dotted as dotted
 from splatwizard_core.training.params import SceneParams as SceneParams
 from splatwizard_core.training.pipeline import TrainingRun as TrainingRun
 from splatwizard_core.training.pipeline import TrainingStopped as TrainingStopped

@@ -18,6 +18,7 @@ from splatwizard_core.tooling import (
     ResolvedConfig,
     RunRequest,
     base_config,
+    dotted,
     first_scene,
     load_scene,
     make_method,
@@ -27,7 +28,7 @@ from splatwizard_core.tooling import (
     useful_starts,
     write_atomic,
 )
-from sw_bench.plan import Plan, flattened, set_words
+from sw_bench.plan import Plan, set_words
 
 SHARED = ".shared"  # in the output folder: configurations of what is trained once for several runs
 TRAINED = ".trained"  # of the core, in each root: trained scenes
@@ -301,7 +302,7 @@ def differing_bases(cells: Sequence[Cell], plugins: PluginManager) -> list[str]:
 def _flat(resolved: ResolvedConfig) -> dict[str, Any]:
     """Return the values that its training reads, by dotted key."""
     values = resolved.config.model_dump(mode="json")
-    return flattened({key: value for key, value in values.items() if key not in type(resolved.config).ENCODING})
+    return dotted({key: value for key, value in values.items() if key not in type(resolved.config).ENCODING})
 
 
 def _shared_job(key: tuple[int, str], resolved: ResolvedConfig, layout: Layout) -> Job:

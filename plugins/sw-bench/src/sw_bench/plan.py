@@ -13,7 +13,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator
 
 from splatwizard_core.api import ConfigError
-from splatwizard_core.tooling import read_toml
+from splatwizard_core.tooling import dotted, read_toml
 
 LABEL = re.compile(r"[\w][\w.+-]*")
 MAX_RUNS = 5_000
@@ -56,7 +56,7 @@ class Values(Table):
     @field_validator("set")
     @classmethod
     def _flat(cls, value: dict[str, Any]) -> dict[str, Any]:
-        found = flattened(value)
+        found = dotted(value)
         if "seed" in found:
             raise ValueError("`seeds` of the plan gives the seeds, not `set`")
         return found
@@ -188,14 +188,6 @@ def set_words(values: Mapping[str, Any]) -> list[str]:
 
 def _spelled(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
-
-
-def flattened(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Spell tables of tables by dotted keys."""
-    found: dict[str, Any] = {}
-    for key, value in table.items():
-        found |= flattened(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
-    return found
 
 
 def _told(error: ValidationError, source: str) -> str:

@@ -97,7 +97,7 @@ def flatten(cls: type[BaseModel], tables: Mapping[str, Any], prefix: str = "") -
     return found
 
 
-def dotted(table: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+def dotted(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Return nested tables as dotted keys, all the way down."""
     found: dict[str, Any] = {}
     for name, value in table.items():
