@@ -58,7 +58,7 @@ def schedule(method: str, verbose: bool, as_json: bool, chosen: Choices) -> None
             })  # fmt: skip
             continue
         own = origins.of(stage)
-        notes = _notes(stage, (entry.distribution, entry.version), own)
+        notes = _notes(stage, (entry.distribution, entry.version), own, str(resolved.pretrained.get("preset", "")))
         if len(stages) > 1 or notes:
             click.echo(f"{stage.name}: {'; '.join([f'{stage.iterations:,} steps', *notes])}")
 
@@ -71,10 +71,10 @@ def schedule(method: str, verbose: bool, as_json: bool, chosen: Choices) -> None
         shared.print_json({"method": method, "preset": resolved.preset, "rate": resolved.rate, "stages": found})
 
 
-def _notes(stage: Stage, method: tuple[str, str], owner: tuple[str, str]) -> list[str]:
+def _notes(stage: Stage, method: tuple[str, str], owner: tuple[str, str], start: str) -> list[str]:
     """Notes beside the plan of a stage: what it starts from, whose it is if not the method's own, what is looked up."""
     notes = {
-        f"starts from a trained {stage.starts_from} scene": stage.starts_from is not None,
+        f"starts from a trained {stage.starts_from} scene{start and f' of preset {start}'}": bool(stage.starts_from),
         f"taught by a trained {' and '.join(stage.taught_by)} scene": bool(stage.taught_by),
         f"of {' '.join(owner)}": owner not in (method, ("", "")),
         f"looked up for the scene: {', '.join(stage.looked_up(None))}": bool(stage.looked_up(None)),
