@@ -15,6 +15,9 @@ mcmc         from a scene that MCMC grows; fast: from one of preset `fast` (one 
 Rungs: wisp at r3, one thing changed, names in RUNGS. Their table has the difference in dB, the factor of the bytes, and
 both as one: ln(bytes over bytes) less the dB times ln(bytes) per dB of the family wisp between r2 and r4.
 
+Prefixes: of each file with layers, each cut beside the family wisp of the same scene: bytes that its hull has at that
+PSNR, and the factor; the BD rate of the whole curve, and the share of the dB that a quarter of the bytes has.
+
 Ratio: at the PSNR of each point of a baseline, bytes on the lower hull of a family, linear in log bytes, over that
 point's bytes; a point below the hull counts at its smallest file, one above is not reached. Bars: 0.50 and 0.75.
 """
@@ -32,6 +35,7 @@ from pathlib import Path
 from published import records
 from rich.console import Console
 from rich.table import Table
+from sw_report.rate_distortion import bd_rate
 from sweep_cells import Cell, add_options, chosen, print_outcomes, run_cells
 
 from sw_wisp.presets import GROWN, PHOTOGRAPHS
@@ -47,6 +51,7 @@ FAMILIES: Mapping[str, Sequence[str]] = {
     "fast": [f"{key}={value}" for key, value in PHOTOGRAPHS.items()],
 }
 """Family -> its values."""
+LAYERED = tuple(family for family, values in FAMILIES.items() if "layers.progressive=true" in values)
 SLOW = {"means": (1.6e-6, 1.6e-7), "shape": (1.3e-3, 1.3e-4), "opacity": (8e-3, 8e-4), "colour": (8e-4, 8e-5)}
 RUNGS: Mapping[str, Sequence[str]] = {
     "without removal": ["prune.rd=false"],
@@ -163,6 +168,50 @@ def print_rungs(groups: Mapping[str, Sequence[Cell]], out: Path, console: Consol
     console.print(table)
 
 
+def curve(cell: Cell, out: Path) -> list[tuple[float, int]]:
+    """(PSNR, bytes) of each cut of a finished cell, the whole file last; nothing for a file without layers."""
+    path = cell.directory(out) / "metrics.json"
+    runs = records([path]) if path.is_file() else []
+    return [(part.metrics["psnr"], part.bytes) for run in runs if len(run.prefixes) > 2 for part in run.prefixes]
+
+
+def quarter(found: Sequence[tuple[float, int]]) -> float:
+    """PSNR that a quarter of the bytes of the last of these has over its own, linear in log bytes between them."""
+    psnr, size = found[-1]
+    wanted = math.log(size / 4)
+    if wanted <= math.log(found[0][1]):
+        return found[0][0] / psnr
+    (low, at_low), (high, at_high) = next((a, b) for a, b in itertools.pairwise(found) if wanted <= math.log(b[1]))
+    share = (wanted - math.log(at_low)) / math.log(at_high / at_low)
+    return (low + share * (high - low)) / psnr
+
+
+def print_prefixes(groups: Mapping[str, Sequence[Cell]], out: Path, console: Console) -> None:
+    """Print the cuts of each file with layers beside the files without layers, a table a file."""
+    flat = [each for cell in groups["wisp"] if cell.seed == 0 for each in measured(cell, out)]
+    for cell in (cell for family in LAYERED for cell in groups[family]):
+        found = curve(cell, out)
+        if not found:
+            continue
+        table = Table(title=cell.name, title_justify="left")
+        for head in ("cut", "PSNR dB", "bytes", "without layers", "bytes x"):
+            table.add_column(head)
+        lowest = lower_hull(flat)[0][0] if flat else math.inf
+        for number, (psnr, size) in enumerate(found, 1):
+            factor = ratio(flat, psnr, size) if psnr >= lowest else None
+            beside = ["", ""] if factor is None else [f"{factor * size:,.0f}", f"{1 / factor:.3f}"]
+            table.add_row(str(number), f"{psnr:.2f}", f"{size:,}", *beside)
+        console.print(table)
+        need = next(size for psnr, size in found if psnr >= 0.9 * found[-1][0])
+        told = f"of the dB {quarter(found):.0%} with 25 % of the bytes, 90 % with {need / found[-1][1]:.0%}"
+        if len(flat) > 1:
+            sides = [([size for _, size in each], [psnr for psnr, _ in each]) for each in (flat, found)]
+            bd = bd_rate(sides[0], sides[1], pareto=True)
+            if bd.value is not None:
+                told += f"; BD rate of the curve {bd.value:+.1f} % over {bd.overlap:.0%} of the range"
+        console.print(told, highlight=False)
+
+
 def print_ratios(groups: Mapping[str, Sequence[Cell]], out: Path, console: Console) -> None:
     """Print the mean ratio of each family and baseline, seed 0, and what is not reached."""
     for method, (bar, _) in BASELINES.items():
@@ -198,6 +247,7 @@ def main() -> int:
     if not args.plan:
         print_cells(groups, args.out, console)
         print_rungs(groups, args.out, console)
+        print_prefixes(groups, args.out, console)
         print_ratios(groups, args.out, console)
     return int(any(outcome.state == "failed" for outcome in outcomes.values()))
 

@@ -424,3 +424,28 @@ def test_bytes_at_equal_psnr_stand_on_the_lower_hull(monkeypatch):
     assert ladder.ratio(found, 31.0, 400) == pytest.approx(0.5)
     assert ladder.ratio(found, 29.5, 200) == pytest.approx(0.5)  # the smallest file
     assert ladder.ratio(found, 32.1, 400) is None
+
+
+def test_cuts_stand_beside_files_without_layers_at_equal_psnr(monkeypatch, tmp_path, capsys):
+    ladder = module("wisp_ladder", monkeypatch)
+    groups = ladder.cells_of("demo:tiny", "", 1)
+    found = {"r1": (30.0, 100), "r3": (32.0, 400)}
+    monkeypatch.setattr(ladder, "measured", lambda cell, out: [found[cell.rate]] if cell.rate in found else [])
+    cell = next(each for each in groups["progressive"] if each.rate == "r3")
+    cuts = [
+        {"packets": number, "bytes": size, "metrics": {"psnr": psnr}}
+        for number, (psnr, size) in enumerate([(25.0, 50), (30.0, 150), (31.0, 300), (32.0, 600)], 1)
+    ]
+    cell.directory(tmp_path).mkdir(parents=True)
+    (cell.directory(tmp_path) / "metrics.json").write_text(json.dumps({**RECORD, "method": "wisp", "prefixes": cuts}))
+    ladder.print_prefixes(groups, tmp_path, ladder.Console(width=120))
+    told = capsys.readouterr().out
+    rows = [line.replace("│", " ").split() for line in told.splitlines() if "│" in line]
+    assert rows == [
+        ["1", "25.00", "50"],
+        *(
+            [str(number), f"{psnr:.2f}", str(size), str(flat), "1.500"]
+            for number, psnr, size, flat in ((2, 30, 150, 100), (3, 31, 300, 200), (4, 32, 600, 400))
+        ),
+    ]
+    assert "of the dB 94% with 25 % of the bytes, 90 % with 25%; BD rate of the curve +50.0 % over 29%" in told
