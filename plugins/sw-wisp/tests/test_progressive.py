@@ -130,7 +130,7 @@ def test_a_step_that_draws_packets_predicts_latents_as_decoders_do(whole, data, 
             )
             wrong = (theirs - view.image(toy.scene.background, theirs.device)).square().mean()
         # Coarse numbers, which networks are told finely in training, make the rest of it.
-        assert (ours - theirs).square().mean() < wrong / 150, number
+        assert (ours - theirs).square().mean() < wrong / 100, number
 
 
 def test_prefixes_that_lack_latents_are_counted():
@@ -177,20 +177,17 @@ def test_flat_trainings_have_no_layers(plugins):
     assert not {"form subsets", "swell subsets", "draw some packets alone", "order packets"} & set(names)
     found = short_training.firings(configured(plugins, **PROGRESSIVE).stages()[0])
     assert found["draw some packets alone"][0] == 60
-    assert found["order packets"] == [80]
+    assert found["order packets"] == [60, 80]
 
 
 def test_subsets_get_their_shares_of_the_bits_worth_most_first():
     draws = torch.Generator().manual_seed(0)
     worth, bits = torch.rand(5_000, generator=draws) - 0.1, 20 + 40 * torch.rand(5_000, generator=draws)
-    levels = torch.full((5_000,), 7)
-    found = split(lambda there: worth, bits, bits, levels, [0.1, 0.3, 0.6])
+    found = split(lambda there: worth, bits, bits, [0.1, 0.3, 0.6])
     shares = torch.stack([bits[found == subset].sum() for subset in range(3)]) / bits.sum()
     assert torch.allclose(shares, torch.tensor([0.1, 0.3, 0.6]), atol=0.002)
     ratios = (worth / bits).clamp_min(0)
     assert ratios[found == 0].min() >= ratios[found == 1].max()
-    deep = split(lambda there: worth.abs() + 1, bits, bits, torch.arange(5_000) % 2 * 9 + 3, [0.2, 0.8])
-    assert (deep[1::2] == 0).sum() == 0  # coarse cells first
 
 
 def test_of_splats_that_cover_each_other_one_is_in_the_first_subset():
@@ -201,7 +198,7 @@ def test_of_splats_that_cover_each_other_one_is_in_the_first_subset():
     def costs(there):  # of a pair little while both are there, of every fifth one alone nothing
         return alone * torch.where(there[twin], 0.01, 1.0) * torch.where(torch.arange(n) // 2 % 5 == 0, 1e-3, 1.0)
 
-    first = split(costs, bits, bits, torch.full((n,), 7), [0.4, 0.6]) == 0
+    first = split(costs, bits, bits, [0.4, 0.6]) == 0
     pairs = first.view(-1, 2).sum(1)
     lasting = torch.arange(n // 2) % 5 != 0
     assert first.sum() == 400

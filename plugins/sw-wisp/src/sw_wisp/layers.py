@@ -17,9 +17,7 @@ from sw_wisp.rate import Forecast
 
 Order = tuple[tuple[int, str], ...]
 """(subset, kind) of each packet."""
-LEVEL_TERM = 0.3
-"""Of the priority of a splat, for each level that it lies deeper."""
-AT_ONCE = 0.12
+AT_ONCE = 0.06
 """Of the splats that are left, those that go before costs are measured anew."""
 LEAST_WORTH = 0.01
 """Quantile of the positive costs of removal that those below it count as."""
@@ -117,21 +115,19 @@ def swelled(values: Tensor, swell: Tensor) -> Tensor:
     return values + torch.cat(parts, dim=1)
 
 
-def split(
-    costs: Callable[[Tensor], Tensor], bits: Tensor, base: Tensor, levels: Tensor, shares: Sequence[float]
-) -> Tensor:
-    """Return the subset [N] int64 of each splat: those go last that cost least for their bits, fine cells first.
+def split(costs: Callable[[Tensor], Tensor], bits: Tensor, base: Tensor, shares: Sequence[float]) -> Tensor:
+    """Return the subset [N] int64 of each splat: those go last that cost least for their bits.
 
     costs   (there [N] bool) -> [N], what pictures of those that are there lose without each of them
-    bits    [N] of a splat's numbers and place; levels [N]
+    bits    [N] of a splat's numbers and place
     base    [N] bits of its first packet, of which each subset gets its share
 
     Costs are measured anew whenever AT_ONCE of the splats have gone: of two that cover each other one stays.
     """
-    sizes, there = base.double(), torch.ones_like(levels, dtype=torch.bool)
+    sizes, there = base.double(), torch.ones_like(bits, dtype=torch.bool)
     ends = torch.tensor(shares, dtype=torch.float64, device=bits.device).cumsum(0)
     ends = ends * (sizes.sum() / ends[-1])
-    penalty = bits.double().log() + LEVEL_TERM * levels.double()
+    penalty = bits.double().log()
     gone: list[Tensor] = []
     worth = costs(there).double()
     positive = worth[worth > 0]
@@ -148,7 +144,7 @@ def split(
             break
         worth = costs(there).double()
     order = torch.cat([order[:kept], *gone])
-    found = torch.empty_like(levels)
+    found = torch.empty_like(order)
     found[order] = torch.searchsorted(ends[:-1], sizes[order].cumsum(0) - sizes[order] / 2)
     return found
 

@@ -66,8 +66,8 @@ class WispStage(Stage):
     4. ROUND    noise becomes soft rounding, soft rounding hard rounding
     5. FREEZE   the integers are fixed; the appearance network learns on
 
-    With `layers.progressive` splats get subsets, some steps draw the first packets alone from then on, and the order of
-    packets is chosen before FREEZE.
+    With `layers.progressive` splats get subsets, some steps draw the first packets alone from then on. The order of
+    packets is chosen then, and for good before FREEZE.
     """
 
     name = "wisp"
@@ -172,7 +172,9 @@ class WispStage(Stage):
         ):
             scheduler.register_task(self.when(measured), self.measure, name="measure rate model")
         if self.config.layers.progressive:
-            scheduler.register_task(self.when(phases.order), self.order_packets, name="order packets")
+            first = min(max(phases.subsets, phases.prefixes), phases.order)  # so that steps draw prefixes of a file
+            ordered = self.when(sorted({first, phases.order}))
+            scheduler.register_task(ordered, self.order_packets, name="order packets")
         scheduler.register_task(self.when(phases.freeze), self.freeze, name="fix integers")
         if self.config.layers.progressive and self.config.layers.train:
             if self.config.layers.swell and self.config.layers.every:
@@ -327,7 +329,7 @@ class WispStage(Stage):
                 seen = replace(every, visible=there)
                 return removal_costs(lambda camera: seen, cameras, rasterizer, scene.background.to(model.device)).cost
 
-            model.subsets = split(costs, sum(bits.values()), bits["base"], model.levels, layers.shares)
+            model.subsets = split(costs, sum(bits.values()), bits["base"], layers.shares)
         model.layers = Layers.of_subsets(len(layers.shares), layers.planes)
         self.measure(model)
 
