@@ -9,7 +9,7 @@ Cells are those of sweep_cells.py: one `sw bench`, resumed by the same command; 
 are missing, unfinished or failed. Families, each at r1 to r5:
 
 wisp         as its preset has it
-progressive  with layers, a quarter of the steps after their beginning draw a prefix
+progressive  with layers
 mcmc         from a scene that MCMC grows; fast: from one of preset `fast` (one of the two is what the preset has)
 
 Rungs: wisp at r3, one thing changed, names in RUNGS. Their table has the difference in dB, the factor of the bytes, and
@@ -46,7 +46,7 @@ BASELINES = {"hac-plus": (0.50, ("r1", "r3", "r5")), "cat-3dgs": (0.75, ("r1", "
 """Method -> bar of the mean ratio, and its rate points."""
 FAMILIES: Mapping[str, Sequence[str]] = {
     "wisp": [],
-    "progressive": ["layers.progressive=true", "layers.train=0.25"],
+    "progressive": ["layers.progressive=true"],
     "mcmc": [f"{key}={value}".lower() for key, value in GROWN.items()],
     "fast": [f"{key}={value}" for key, value in PHOTOGRAPHS.items()],
 }

@@ -143,7 +143,7 @@ class LayersOfTheFile(Params):
     )
     planes: int = Field(1, ge=0, le=2, description="refinements of shape, size and colour, each by a factor 3")
     train: float = Field(0.5, ge=0, le=1, description="share of steps that draw some packets alone")
-    weight: float = Field(0.5, gt=0, le=1, description="of the loss of such a step")
+    weight: float = Field(1.0, gt=0, le=1, description="of the loss of such a step")
     swell: int = Field(
         60, ge=0, le=10_000, description="updates that fit size and opacity of subsets for each number of missing ones"
     )
