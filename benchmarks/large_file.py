@@ -29,7 +29,7 @@ from sw_gaussians.ply_gaussians import file_parts
 from splatwizard_core.tooling import peak_rss_bytes, reset_peak_rss, rss_bytes
 
 ROWS_AT_ONCE = 1 << 18
-KEPT = ("bytes", "pruned", "merged", "encodes", "tiles", "quality", "foreseen", "tried", "peak_bytes")
+KEPT = ("bytes", "pruned", "merged", "encodes", "tiles", "quality", "foreseen", "found", "tried", "peak_bytes")
 """Of the record of `sw compress`."""
 
 

@@ -7,7 +7,7 @@ error by its last byte: one price of error for bytes decides all levels.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,11 @@ class Curve:
         between = np.exp(np.interp(levels, self.levels, np.log(error)))
         return Curve(self.name, levels, np.interp(levels, self.levels, size), between)
 
+    def sized(self, size: Array) -> Curve:
+        """The same with other bytes [K], at levels evenly spread from the first to the last."""
+        known = np.linspace(self.levels[0], self.levels[-1], len(size))
+        return replace(self, bytes=np.interp(self.levels, known, np.minimum.accumulate(size)))
+
 
 @dataclass(frozen=True)
 class Allocation:
@@ -62,6 +67,11 @@ def at_price(curves: Sequence[Curve], price: float) -> Allocation:
     """
     places = [int((curve.error + price * curve.bytes).argmin()) for curve in curves]
     return _at(curves, places)
+
+
+def at_levels(curves: Sequence[Curve], levels: Mapping[str, float]) -> Allocation:
+    """What the curves say of levels of theirs."""
+    return _at(curves, [int(abs(curve.levels - levels[curve.name]).argmin()) for curve in curves])
 
 
 def within(curves: Sequence[Curve], budget: float) -> Allocation | None:

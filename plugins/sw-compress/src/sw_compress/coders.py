@@ -130,15 +130,27 @@ class Quantized:
         """Bytes of each attribute at each of its levels, or the `coarsest`, from entropies; nothing is coded."""
         count = model.num_rows
         part, some = model, slice(-1 if coarsest else None, None)
-        found = {POSITIONS: _position_sizes(model, POSITION_LEVELS[some])}
+        found = {POSITIONS: position_sizes(model, POSITION_LEVELS[some])}
         if count > SAMPLE:
             give_back()
             chosen = torch.randperm(count, generator=torch.Generator().manual_seed(0))[:SAMPLE].sort().values
             part = select(model, chosen.to(model.device))
+        return found | self.column_sizes(part, count, some=some)
+
+    @torch.no_grad()
+    def column_sizes(
+        self, part: GaussianModel, count: int, tiles: int = 1, some: slice = slice(None)
+    ) -> dict[str, NDArray[np.float64]]:
+        """The same of all but the positions, of a model that a part stands for.
+
+        count   Gaussians of the model
+        tiles   that it is written in, each with tables of its own
+        some    of the levels
+        """
         rounding = Rounding(part, self.power, OWN_BASIS)
-        scale = count / max(part.num_rows, 1)
-        sections = _Sections(rounding, suitable_classes(count), TABLE_BITS / scale)
-        for name in self.attributes(model):
+        scale, found = count / max(part.num_rows, 1), {}
+        sections = _Sections(rounding, suitable_classes(count // tiles), TABLE_BITS * tiles / scale)
+        for name in self.attributes(part):
             if name != POSITIONS:
                 steps = [Steps({name: STEPS[name] * 2.0**level}, POSITION_BITS) for level in self.levels(name)[some]]
                 found[name] = np.array([sections.bits(name, each) for each in steps]) * scale / 8
@@ -163,7 +175,7 @@ class Quantized:
         return CodecChoice(name="gaussians-quantized", settings=numbers)
 
 
-def _position_sizes(model: GaussianModel, levels: NDArray[np.float64]) -> NDArray[np.float64]:
+def position_sizes(model: GaussianModel, levels: NDArray[np.float64] = POSITION_LEVELS) -> NDArray[np.float64]:
     """Bytes of the positions at ascending levels."""
     finest, means = int(POSITION_BITS - levels[0]), model.means.detach()
     grid, parts = replace(grid_of(means), bits=finest), blocks(len(means), means.device)

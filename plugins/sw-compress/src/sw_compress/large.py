@@ -24,9 +24,10 @@ from splatwizard_core.api import ContainerReader, GaussianModel, RasterOptions, 
 from splatwizard_core.tooling import NegotiatedRasterizer
 from sw_codecs.models.quantized import FAINTEST
 from sw_compress import coders
-from sw_compress.allocation import of_error
+from sw_compress.allocation import at_price, of_error, within
 from sw_compress.among import Among, coarse, sample_rows, without
-from sw_compress.coders import FIXED_BYTES, Quantized
+from sw_compress.calibrating import calibrate, rounded_error, sizes_of
+from sw_compress.coders import FIXED_BYTES, Levels, Quantized
 from sw_compress.filling import AIM, MOST_ENCODES
 from sw_compress.large_scene import LargeScene, read_scene
 from sw_compress.measuring import Errors
@@ -35,7 +36,16 @@ from sw_compress.pruning import Pruning
 from sw_compress.quality import Pictures, decibels
 from sw_compress.reducing import Reduction
 from sw_compress.rows import IMPORTANCE, like, select, with_degree
-from sw_compress.search import Choice, Search, for_quality, for_size, least_bytes, too_small, within_bytes
+from sw_compress.search import (
+    COARSEST_PRICE,
+    Choice,
+    Search,
+    for_quality,
+    for_size,
+    least_bytes,
+    too_small,
+    within_bytes,
+)
 from sw_compress.shelf import Shelf
 from sw_compress.stages import Stages, give_back
 from sw_compress.targets import LEAST_SHARE, QUALITY_MARGIN, Target
@@ -47,6 +57,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from splatwizard_core.api import PluginManager, Rasterizer
+    from sw_codecs.models.sh_basis import Basis
 
 LARGE = {"cpu": 4_000_000, "cuda": 16_000_000}
 """Gaussians above which a file is made small in two passes, by kind of device."""
@@ -78,6 +89,7 @@ class WrittenLarge:
     """A file that was written, as `compressing` goes on with it."""
 
     facts: dict[str, Any]
+    judge: Pictures
     held_out: Pictures
     seen: Views
     plugins: PluginManager
@@ -92,7 +104,11 @@ class WrittenLarge:
         for name, size in reader.sections.items():
             name = name.rpartition("/")[2]
             sections[name] = sections.get(name, 0) + size
-        return scene, {"sections": sections}
+        facts: dict[str, Any] = {"sections": sections}
+        if "foreseen" in self.facts:
+            with self.stages.timed("check"):
+                facts["found"] = round(decibels(self.judge.error(scene)), 2)
+        return scene, facts
 
 
 def decoded(path: Path, plugins: PluginManager, device: torch.device) -> tuple[LargeScene, ContainerReader]:
@@ -122,7 +138,7 @@ def write_large(blocks: PlyBlocks, asked: Asked, path: Path) -> WrittenLarge:
     with contextlib.ExitStack() as shelves:
         work = _Work(blocks, asked, path, shelves)
         facts = work.for_size() if asked.target.size is not None else work.for_quality()
-    return WrittenLarge(facts, work.held_out, work.seen, asked.plugins, asked.device, asked.stages)
+    return WrittenLarge(facts, work.judge, work.held_out, work.seen, asked.plugins, asked.device, asked.stages)
 
 
 class _Sample:
@@ -175,14 +191,16 @@ class _Sample:
 
         lost    by fewer Gaussians, drawn without higher SH
 
-        Errors of rounding are the sample's, as many times larger: they have no common sign.
+        Errors of rounding are the sample's, as many times larger: they have no common sign. What is known of the
+        whole corrects them.
         """
         part, coder = choice.model, self.search.coder
         reduced, plain = self.judge.error(part), self._plain.error(with_degree(part, 0))
         both = self.judge.error(coder.rounded(part, choice.allocation.levels))
         coder.forget()
         rest = min(max(reduced / plain, 1.0), MOST_BY_REST) if plain > 0 else 1.0
-        found = rest * lost + max(both - reduced, 0.0) / self.share
+        known = self.search.errors.correction(choice.allocation.levels)
+        found = rest * lost + known * max(both - reduced, 0.0) / self.share
         self.whole[part.num_rows] = found
         return found
 
@@ -221,7 +239,9 @@ class _Work:
             asked.say(f"{blocks.path.name}: {blocks.count - read:,} Gaussians mean nothing and were left out")
         light = scene.light
         self.coder = Quantized(asked.plugins, raster_of(light), precise=True)
-        rasterizer = NegotiatedRasterizer(asked.plugins, device=asked.device, options=raster_of(light))
+        self._rasterizer = rasterizer = NegotiatedRasterizer(
+            asked.plugins, device=asked.device, options=raster_of(light)
+        )
         with asked.stages.timed("cameras"), torch.no_grad():
             self.seen = made_up_views(light, rasterizer, asked.views) if asked.given is None else asked.given
             self.held_out = Pictures(scene, self.seen.held_out, rasterizer, RasterOptions(alpha=True))
@@ -230,6 +250,12 @@ class _Work:
             pruning = Pruning(light, self.seen.fit, rasterizer, keeps_unseen=keeps_unseen(asked))
             unseen = int(pruning.unseen.sum())
             self._whole: Whole | None = Whole(scene, pruning, self.seen.judge, rasterizer)
+        with asked.stages.timed("sensitivities"):
+            search = self.sample.search
+            self.judge = calibrate(
+                search.errors, search.model, scene, pruning.importance, self.coder, self._compared(), self.seen.judge,
+                rasterizer,
+            )  # fmt: skip
         self.facts: dict[str, Any] = {
             "source": {"file": blocks.path.name, "bytes": blocks.path.stat().st_size, "gaussians": read},
             "target": {"bytes": asked.target.size, "psnr": asked.target.quality},
@@ -242,6 +268,16 @@ class _Work:
         self.shelves.callback(shelf.close)
         return shelf
 
+    def _compared(self) -> Levels:
+        """Levels about as a choice will have, at which the sample is compared with the whole."""
+        search, target = self.sample.search, self.asked.target
+        curves, count = search.errors.curves(self.coder, search.model), search.model.num_rows
+        if target.size is None:
+            assert target.quality is not None  # it is asked for
+            return of_error(curves, 10 ** (-target.quality / 10) * self.sample.share).levels
+        budget = self.sample.bytes_of(target.size) * count / min(search.count or count, count)
+        return (within(curves, budget) or at_price(curves, COARSEST_PRICE)).levels
+
     def for_size(self) -> dict[str, Any]:
         """Write the best file of the size."""
         size, sample = self.asked.target.size, self.sample
@@ -251,6 +287,13 @@ class _Work:
         choice = sample.search.coarsest if choice is None else self._enough(choice, sample.bytes_of(size))
         assert choice is not None  # a search looks at one part at least
         file = self._reduced(choice)
+        choice, basis = self._measured(choice, file)
+        choice = choice.within(sample.bytes_of(size)) or choice.coarsest()
+        with self.asked.stages.timed("search"):
+            error = rounded_error(
+                file.scene, file.importance, self.coder, choice.allocation.levels, basis, self.judge, self._rasterizer
+            )
+        self.facts["foreseen"] = round(decibels(error), 2)
         best, most, held = choice, 0, None
         before: tuple[float, float] | None = None  # bytes by the tables, and of the file
         for _ in range(MOST_ENCODES):
@@ -289,6 +332,7 @@ class _Work:
             choice = for_quality(sample.search, quality - 10 * math.log10(sample.share), exact)
         choice = self._good(choice, 10 ** (-quality / 10))
         file = self._reduced(choice)
+        choice, _ = self._measured(choice, file)
         best: tuple[int, Choice] | None = None
         good: tuple[float, float] | None = None  # decibels by the tables, and in pictures
         bad: tuple[float, float] | None = None
@@ -360,8 +404,13 @@ class _Work:
             if other is None or (found := sample.foreseen(other, self._lost(other))) >= error:
                 break
             choice, error = other, found
-        self.facts["foreseen"] = round(decibels(error), 2)
         return choice
+
+    def _measured(self, choice: Choice, file: TiledFile) -> tuple[Choice, Basis | None]:
+        """The choice with bytes as of what is written, and a basis of its higher SH coefficients."""
+        with self.asked.stages.timed("search"):
+            sizes, basis = sizes_of(file.scene, file.importance, self.coder)
+        return choice.sized(sizes, self.sample.share), basis
 
     def _good(self, choice: Choice, error: float) -> Choice:
         """The choice, or one of so many Gaussians that what is gone leaves enough of an error to rounding."""
@@ -398,7 +447,7 @@ def _reduced(
     whole: Whole, rows: Tensor, counts: list[int], importance: list[Tensor], asked: Asked
 ) -> Iterator[GaussianModel]:
     """Tiles of the rows that stay, in which neighbours merge until `counts` are left; fills `importance`."""
-    scene, weights, known = whole.scene, whole.weights, whole.importance
+    scene, weights, known = whole.scene, whole.weights, whole.importance  # of what none shows, the median, and nothing
     with track("reduce", total=len(scene.tiles), unit="tiles") as bar:
         for tile in scene.tiles:
             part = scene.rows(tile)
@@ -410,7 +459,7 @@ def _reduced(
             count, of = max(1, counts[tile]), known[own]
             if count < len(own):
                 all_of = torch.arange(len(own), device=own.device)
-                merged, of = merged_by(model, all_of, count, weights[own])
+                merged, of = merged_by(model, all_of, count, weights[own], summed=of)
                 model = like(model, merged)
                 drawn = model.opacity_logits >= FAINTEST
                 if not bool(drawn.all()):

@@ -7,7 +7,7 @@ other. It is parted into tiles, runs of that order; a tile is whole in memory wh
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -131,16 +131,34 @@ class LargeScene:
     @torch.no_grad()
     def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
         """All Gaussians in their colours as the camera sees them."""
-        light, colors = self.light, torch.empty_like(self.light.means)
-        for tile in self.tiles:
-            rest, start = self.rest(tile), self.limits[tile]
-            for first in range(0, len(rest), ROWS_AT_ONCE):
-                rows = slice(start + first, start + min(first + ROWS_AT_ONCE, len(rest)))
-                sh = SH(dc=light.sh_dc[rows], rest=rest[first : first + ROWS_AT_ONCE], active_degree=self.degree)
-                if not self.degree:
-                    sh.rest = None
-                colors[rows] = sh_colors(sh, camera.center.to(light.means), light.means[rows])
+        light = self.light
+        colors = self.colors(camera, None)[0]
         return GaussianInputs(light.means, light.opacities, light.scales, light.quats, colors=colors)
+
+    @torch.no_grad()
+    def colors(
+        self, camera: Camera, seen: Tensor | None, *others: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+    ) -> list[Tensor]:
+        """Colours [N,3] as the camera sees them.
+
+        seen    whether each Gaussian [N] needs one; None: all do
+        others  give other coefficients, dc [n,1,3] and the rest, of some rows [n] and their rest: more colours for each
+        """
+        light = self.light
+        found = [torch.zeros_like(light.means) for _ in range(1 + len(others))]
+        center = camera.center.to(light.means)
+        for tile in self.tiles:
+            part, rest = self.rows(tile), self.rest(tile)
+            rows = torch.arange(part.start, part.stop, device=self.device)
+            if seen is not None:
+                mine = seen[part]
+                rows, rest = rows[mine], rest[mine]
+            for some, higher in zip(rows.split(ROWS_AT_ONCE), rest.split(ROWS_AT_ONCE), strict=True):
+                known = [(light.sh_dc[some], higher), *(other(some, higher) for other in others)]
+                for colors, (dc, each) in zip(found, known, strict=True):
+                    sh = SH(dc=dc, rest=each if self.degree else None, active_degree=self.degree)
+                    colors[some] = sh_colors(sh, center, light.means[some])
+        return found
 
     @classmethod
     def of_tiles(cls, tiles: Iterable[GaussianModel], shelf: Shelf) -> LargeScene:

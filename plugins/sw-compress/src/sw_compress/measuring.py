@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -35,6 +36,7 @@ class Errors:
         names = coder.attributes(model)
         finest = coder.finest(model)
         self._measured: dict[str, tuple[list[float], list[float]]] = {}
+        self._corrections: dict[str, tuple[np.ndarray | float, float]] = {}
         with track("measure precision", total=1 + len(names) * len(MEASURED), unit="models") as bar:
             rounding = coder.rounding(model)
             give_back()
@@ -73,9 +75,21 @@ class Errors:
         result: np.ndarray = 2.0**found
         return result
 
+    def correct(self, name: str, size: np.ndarray, error: float) -> None:
+        """Multiply bytes [L] at the levels of an attribute, and its errors, in all curves."""
+        self._corrections[name] = size, error
+
+    def correction(self, levels: Mapping[str, float]) -> float:
+        """Factor on the sum of the errors of these levels."""
+        plain = {name: float(self.at(name, np.array([level]))[0]) for name, level in levels.items()}
+        whole = sum(error * self._corrections.get(name, (1.0, 1.0))[1] for name, error in plain.items())
+        return whole / max(sum(plain.values()), 1e-30)
+
     def curves(self, coder: Quantized, model: GaussianModel) -> list[Curve]:
         """Bytes and errors of all attributes of a model, which may be a part of the one that was measured."""
-        return [
-            Curve(name, coder.levels(name), size, self.at(name, coder.levels(name)), name == "positions").finer()
-            for name, size in coder.sizes(model).items()
-        ]
+        found = []
+        for name, size in coder.sizes(model).items():
+            more, worse = self._corrections.get(name, (1.0, 1.0))
+            levels = coder.levels(name)
+            found.append(Curve(name, levels, more * size, worse * self.at(name, levels), name == "positions").finer())
+        return found

@@ -77,12 +77,17 @@ class Pictures:
         options: RasterOptions,
         label: str = "draw the source",
     ) -> None:
-        self.cameras, self._rasterizer, self._options = list(cameras), rasterizer, options
+        self.cameras, self._rasterizer, self._options = list[Camera](), rasterizer, options
         self._known: list[tuple[Tensor, Tensor]] = []
-        with track(label, total=len(self.cameras), unit="views") as bar:
-            for camera in self.cameras:
-                self._known.append(self._drawn(source, camera))
+        with track(label, total=len(cameras), unit="views") as bar:
+            for camera in cameras:
+                self.add(source, camera)
                 bar.advance()
+
+    def add(self, source: GaussianModel, camera: Camera) -> None:
+        """Draw another view of the source."""
+        self.cameras.append(camera)
+        self._known.append(self._drawn(source, camera))
 
     @torch.no_grad()
     def _drawn(self, model: GaussianModel, camera: Camera) -> tuple[Tensor, Tensor]:
@@ -94,11 +99,14 @@ class Pictures:
 
     def error(self, model: GaussianModel) -> float:
         """Mean squared error over pixels that show something, and over views, unrounded."""
-        found = []
-        for camera, (known, known_shown) in zip(self.cameras, self._known, strict=True):
-            image, shown = self._drawn(model, camera)
-            found.append(_masked((image - known).double().square(), shown | known_shown))
+        found = [self.error_of(view, model) for view in range(len(self.cameras))]
         return sum(found) / max(len(found), 1)
+
+    def error_of(self, view: int, model: GaussianModel) -> float:
+        """The same of one view."""
+        known, known_shown = self._known[view]
+        image, shown = self._drawn(model, self.cameras[view])
+        return _masked((image - known).double().square(), shown | known_shown)
 
     def quality(self, model: GaussianModel, label: str = "measure") -> Quality:
         """Compare all views with colours rounded to 8 bits."""

@@ -86,7 +86,9 @@ class Reduction:
         give_back()  # what drawing holds on to
         if len(rows) > count and power < 1:
             # Of some that merged so little is left that nothing is drawn.
-            merged, weights = merged_by(self.model, rows, count, self.weights()[rows], faintest=FAINTEST)
+            merged, weights = merged_by(
+                self.model, rows, count, self.weights()[rows], summed=self.pruning.importance[rows], faintest=FAINTEST
+            )
             if merged.sh_rest.untyped_storage().nbytes() > merged.sh_rest.nbytes:  # memory of all that merged
                 give_back()
                 merged.sh_rest.data = merged.sh_rest.clone()

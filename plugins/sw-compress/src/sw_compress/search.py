@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from splatwizard_core.api import GaussianModel, UserInputError
-from sw_compress.allocation import Allocation, Curve, at_price, of_error, within
+from sw_compress.allocation import Allocation, Curve, at_levels, at_price, of_error, within
 from sw_compress.coders import FIXED_BYTES, POSITIONS, Quantized
 from sw_compress.measuring import Errors
 from sw_compress.quality import Pictures, decibels
@@ -128,6 +131,16 @@ class Choice:
     def placed(self) -> list[Curve]:
         """The curves with places as precise as here."""
         return [self._fixed(curve) if curve.name == POSITIONS else curve for curve in self.curves]
+
+    def sized(self, sizes: Mapping[str, NDArray[np.float64]], share: float) -> Choice:
+        """The choice with other bytes at all levels: a share of these."""
+        curves = [curve.sized(share * sizes[curve.name]) for curve in self.curves]
+        return replace(self, curves=curves, allocation=at_levels(curves, self.allocation.levels))
+
+    def within(self, budget: float) -> Choice | None:
+        """The same Gaussians in a file of `budget` bytes by the estimate."""
+        found = within(self.curves, budget - FIXED_BYTES)
+        return None if found is None else replace(self, allocation=found)
 
     def resized(self, budget: float) -> Choice | None:
         """The same Gaussians, places as precise as here, in a file of `budget` bytes by the estimate."""

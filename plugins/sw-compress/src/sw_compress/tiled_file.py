@@ -60,7 +60,7 @@ class TiledFile:
     """
 
     def __init__(self, scene: LargeScene, importance: Tensor, coder: Quantized, own_basis: bool) -> None:
-        self.scene, self.coder, self.classes = scene, coder, None
+        self.scene, self.importance, self.coder, self.classes = scene, importance, coder, None
         if coder.power:
             self.classes = precision.classes_of(importance.cpu().double().numpy(), coder.power)
         self.grid = PositionGrid.fit(scene.light.means.detach().cpu().numpy(), 1)

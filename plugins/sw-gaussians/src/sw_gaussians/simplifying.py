@@ -56,37 +56,39 @@ def merged_to(
     Raises ShapeError for surfels.
     """
     rows = torch.arange(model.num_rows, device=model.device)
-    splats, _, left = _reduced(model, rows, count, significance, widen)
-    return model_of(splats, left, model)
+    pool = _reduced(model, rows, count, significance, None, widen)
+    return model_of(pool.splats, pool.order, model)
 
 
 @torch.no_grad()
 def merged_by(
-    model: GaussianModel, rows: Tensor, count: int, significance: Tensor, *, widen: bool = False,
-    faintest: float = -math.inf,
+    model: GaussianModel, rows: Tensor, count: int, significance: Tensor, *, summed: Tensor | None = None,
+    widen: bool = False, faintest: float = -math.inf,
 ) -> tuple[GaussianModel, Tensor]:  # fmt: skip
-    """As `merged_to` of some rows [M], with the significance of each Gaussian of the result.
+    """As `merged_to` of some rows [M], with what each Gaussian of the result stands for: sums.
 
-    significance    [M] of these rows; of the result it is the sum over what it stands for
+    significance    [M] of these rows
+    summed          [M] what is summed; None: the significance
     faintest        logit of the opacity below which a Gaussian is left out in the end
     """
-    splats, weights, left = _reduced(model, rows, count, significance, widen)
-    assert weights is not None  # they were given
-    left = left[logits_of(splats.opacities[left]) >= faintest]
-    found = weights[left].to(significance) * significance.median().clamp_min(1e-30)
-    return model_of(splats, left, model), found
+    pool = _reduced(model, rows, count, significance, summed, widen)
+    left = pool.order[logits_of(pool.splats.opacities[pool.order]) >= faintest]
+    if pool.summed is not None:
+        return model_of(pool.splats, left, model), pool.summed[left]
+    assert pool.weights is not None  # they were given
+    found = pool.weights[left].to(significance) * significance.median().clamp_min(1e-30)
+    return model_of(pool.splats, left, model), found
 
 
 def _reduced(
-    model: GaussianModel, rows: Tensor, count: int, significance: Tensor | None, widen: bool
-) -> tuple[Splats, Tensor | None, Tensor]:
-    """Merge some rows of a model until at most so many are left: all Gaussians, what they weigh in medians, and which
-    are left [n]."""
+    model: GaussianModel, rows: Tensor, count: int, significance: Tensor | None, summed: Tensor | None, widen: bool
+) -> _Pool:
+    """Merge some rows of a model until at most so many are left; weights are in medians."""
     curve = _curve(model.means.detach().index_select(0, rows), 0)
     weights = None
     if significance is not None:
         weights = (significance / significance.median().clamp_min(1e-30)).to(model.means)[curve]
-    pool = _Pool.of(splats_of(model, rows[curve]), weights)
+    pool = _Pool.of(splats_of(model, rows[curve]), weights, None if summed is None else summed[curve])
     near, wave = NEAR, 0
     while (n := len(pool.order)) > max(count, 1):
         if pool.table.device.type == "cpu":
@@ -100,14 +102,14 @@ def _reduced(
         wave += 1
         del pairs
     trim()
-    return pool.splats, pool.weights, pool.order
+    return pool
 
 
 @dataclass
 class _Pool:
     """Gaussians that merge in place: neighbours in space stay neighbours in memory.
 
-    splats, weights     [N] of all rows; what was merged stands in the first row of its pair
+    splats, weights, summed     [N] of all rows; what was merged stands in the first row of its pair
     table               [N,15] what prices look at but SH: place 3, covariance 6, volume, mass, opacity, colour 3
     order               [n] rows that are left
     unit, center        size and middle of the scene, world units
@@ -115,13 +117,14 @@ class _Pool:
 
     splats: Splats
     weights: Tensor | None
+    summed: Tensor | None
     table: Tensor
     order: Tensor
     unit: float
     center: Tensor
 
     @classmethod
-    def of(cls, splats: Splats, weights: Tensor | None) -> _Pool:
+    def of(cls, splats: Splats, weights: Tensor | None, summed: Tensor | None = None) -> _Pool:
         """These Gaussians, best along a curve; they are overwritten."""
         unit, center = _unit(splats), splats.means.mean(dim=0)
         parts = (Splats(*each) for each in zip(*map(_blocks, splats), strict=True))
@@ -129,7 +132,7 @@ class _Pool:
         for part in parts:
             start, end = end, end + len(part.means)
             table[start:end] = _table(part, unit, center)
-        return cls(splats, weights, table, torch.arange(len(table), device=table.device), unit, center)
+        return cls(splats, weights, summed, table, torch.arange(len(table), device=table.device), unit, center)
 
     @property
     def is_native(self) -> bool:
@@ -149,8 +152,9 @@ class _Pool:
     def merge(self, pairs: Tensor, widen: bool) -> None:
         """One Gaussian in place of each pair of rows [P,2]."""
         (_native_merge if self.is_native else _merge)(self, pairs, widen)
-        if self.weights is not None:
-            self.weights[pairs[:, 0]] = self.weights[pairs].sum(dim=1)
+        for each in (self.weights, self.summed):
+            if each is not None:
+                each[pairs[:, 0]] = each[pairs].sum(dim=1)
         gone = torch.zeros(len(self.table), dtype=torch.bool, device=pairs.device)
         gone[pairs[:, 1]] = True
         self.order = self.order[~gone[self.order]]
