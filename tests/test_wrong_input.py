@@ -122,6 +122,8 @@ ROWS = [
     Row("compress {grey.swz} --size 300 kB --out {new}.swz", "has a blank in it: write 300kB"),
     Row("compress {grey.swz} --size 300 KiB --out {new}.swz", "has a blank in it: write 300KiB"),
     Row("run --scene demo:tiny --size 5 MB", "has a blank in it: write 5MB"),
+    Row("compress {grey.swz} --size=300 kB --out {new}.swz", "--size 300 kB has a blank in it: write 300kB"),
+    Row("run --scene demo:tiny --size=5 MB", "has a blank in it: write 5MB"),
     Row("lod {grey.swz} --out {new}.swz --levels 3", "--levels"),
     Row("lod {cut.ply} --out {new}/lod-meta.json", "cut.ply"),
     Row("lod {grey.swz} --out {new}/lod-meta.json --chunk 8mb", "no number of Gaussians"),

@@ -69,7 +69,8 @@ class LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        for option, number, unit in zip(args, args[1:], args[2:], strict=False):
+        words = "\0".join(args).replace("=", "\0").split("\0")
+        for option, number, unit in zip(words, words[1:], words[2:], strict=False):
             if option in ("--size", "--bytes") and number[-1:].isdigit() and unit[1:].lower() in ("b", "ib"):
                 raise click.UsageError(f"{option} {number} {unit} has a blank in it: write {number}{unit}", ctx)
         try:
@@ -114,8 +115,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run `sw` and return its exit status: 0, 2 wrong input, 1 failure, 130 interrupted."""
     open_streams()
     arguments = list(sys.argv[1:] if argv is None else argv)
-    debug = "--debug" in arguments
-    handler = logging.StreamHandler()
+    handler, debug = logging.StreamHandler(), "--debug" in arguments
     handler.setFormatter(_AsInstalled("%(levelname)s: %(message)s"))
     logging.basicConfig(level=logging.DEBUG if debug else logging.WARNING, handlers=[handler])
     for noisy in ("PIL", "torch", "matplotlib"):
