@@ -111,13 +111,25 @@ def test_what_is_foreseen_is_found(tmp_path, ball, monkeypatch):
     assert done.record["foreseen"] == pytest.approx(decibels(known.error(done.model)), abs=0.5)
 
 
+def test_what_a_sample_tells_is_corrected_by_the_whole(tmp_path, ball, monkeypatch):
+    """A tenth of the scene among stand-ins foresaw 62.1 dB where 47.6 were found, and 45.4 at cameras held out."""
+    monkeypatch.setattr(large, "SAMPLE", 600)
+    monkeypatch.setattr(large, "RUN", 60)
+    monkeypatch.setattr(large_scene, "TILE", 3_000)
+    source = tmp_path / "ball.ply"
+    export_model(ball(6_000, degree=1), source, load_plugins())
+    record = compress(source, size=96_000, views=12, device="cpu").record
+    assert record["foreseen"] == pytest.approx(record["found"], abs=0.5)
+    assert record["quality"]["psnr"] > 47
+
+
 def test_equal_calls_give_equal_bytes(source, small):
     assert compress(source, size=SIZE, views=6, device="cpu").data == small.out.read_bytes()
 
 
 def test_a_quality_is_reached_and_little_exceeded(source):
-    done = compress(source, quality="40dB", views=6, device="cpu")
-    assert 40 <= done.record["quality"]["psnr"] <= 40.4
+    done = compress(source, quality="45dB", views=6, device="cpu")
+    assert 45 <= done.record["quality"]["psnr"] <= 45.4
 
 
 def test_a_number_and_a_degree_may_be_given(source):

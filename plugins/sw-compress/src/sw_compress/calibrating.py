@@ -23,7 +23,7 @@ from sw_compress.coders import POSITIONS, Levels, Quantized
 from sw_compress.large_scene import LargeScene
 from sw_compress.quality import Pictures
 from sw_compress.rounding import Rounding
-from sw_compress.rows import IMPORTANCE, select
+from sw_compress.rows import IMPORTANCE, select, with_degree
 from sw_compress.stages import give_back
 
 if TYPE_CHECKING:
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-MOST_FACTOR = 30.0
-"""By which an error of the sample is multiplied or divided at most."""
+MOST_APART = 4.0
+"""Factor by which that of one attribute may be larger or smaller than that of all: it was found at one level only."""
 
 
 def calibrate(
@@ -48,28 +48,34 @@ def calibrate(
     levels      at which errors are compared
     """
     share = sample.num_rows / scene.num_rows
-    sizes, basis = sizes_of(scene, importance, coder)
+    sizes, basis = sizes_of(scene, importance, coder, sample.active_sh_degree)
     found, pictures = _Rounded(scene, importance, coder, levels, basis).alone(cameras, rasterizer)
     give_back()
-    expected = coder.sizes(sample)
-    for name, error in found.items():
-        factor = error * share / max(float(errors.at(name, np.array([levels[name]]))[0]), 1e-30)
+    names, expected = coder.attributes(sample), coder.sizes(sample)
+    told = {name: float(errors.at(name, np.array([levels[name]]))[0]) / share for name in names}
+    all_of = sum(found[name] for name in names) / max(sum(told.values()), 1e-30)
+    for name in names:  # of coefficients that are left out nothing is known
+        factor = found[name] / max(told[name] * all_of, 1e-30)
         more = np.maximum(sizes[name] * share, 1) / np.maximum(expected[name], 1)
-        errors.correct(name, more, min(max(factor, 1 / MOST_FACTOR), MOST_FACTOR))
+        errors.correct(name, more, all_of * min(max(factor, 1 / MOST_APART), MOST_APART))
     return pictures
 
 
-def sizes_of(scene: LargeScene, importance: Tensor, coder: Quantized) -> tuple[dict[str, Array], Basis | None]:
-    """Bytes of each attribute of a scene at each of its levels, and a basis of its higher SH coefficients."""
+def sizes_of(
+    scene: LargeScene, importance: Tensor, coder: Quantized, degree: int
+) -> tuple[dict[str, Array], Basis | None]:
+    """Bytes of each attribute of a scene at each of its levels, SH up to a degree, and a basis of all of these."""
     generator = torch.Generator().manual_seed(0)
     rows = torch.randperm(scene.num_rows, generator=generator)[: coders.SAMPLE].sort().values.to(scene.device)
     some = scene.part(rows)
     setattr(some, IMPORTANCE, importance[rows])
-    sizes = coder.column_sizes(some, scene.num_rows, len(scene.tiles))
+    few = with_degree(some, degree)
+    setattr(few, IMPORTANCE, importance[rows])
+    sizes = coder.column_sizes(few, scene.num_rows, len(scene.tiles))
     basis = Rounding(some, coder.power, coders.OWN_BASIS).basis
-    del some
+    del some, few
     give_back()
-    return {**sizes, POSITIONS: coders.position_sizes(scene.light)}, basis
+    return {**sizes, POSITIONS: coders.position_sizes(scene.light, limits=scene.limits)}, basis
 
 
 class _Rounded:

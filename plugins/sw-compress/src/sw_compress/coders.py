@@ -5,7 +5,8 @@ A level is the step of an attribute in octaves of the step here; bits of the pos
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -175,14 +176,20 @@ class Quantized:
         return CodecChoice(name="gaussians-quantized", settings=numbers)
 
 
-def position_sizes(model: GaussianModel, levels: NDArray[np.float64] = POSITION_LEVELS) -> NDArray[np.float64]:
-    """Bytes of the positions at ascending levels."""
+def position_sizes(
+    model: GaussianModel, levels: NDArray[np.float64] = POSITION_LEVELS, limits: Sequence[int] = ()
+) -> NDArray[np.float64]:
+    """Bytes of the positions at ascending levels.
+
+    limits  first row of each tile, then N, where each is coded for itself
+    """
     finest, means = int(POSITION_BITS - levels[0]), model.means.detach()
     grid, parts = replace(grid_of(means), bits=finest), blocks(len(means), means.device)
     if len(means) > SAMPLE:
         give_back()  # the grid took doubles of all
     codes = torch.cat([interleave(cells_of(means[rows], grid).long()) for rows in parts])
-    bits = octree_bits(codes.sort().values, finest)
+    tiles = [codes] if not limits else codes.split([end - start for start, end in itertools.pairwise(limits)])
+    bits = np.sum([octree_bits(tile.sort().values, finest) for tile in tiles], axis=0)
     return np.array([bits[int(POSITION_BITS - level)] / 8 for level in levels])
 
 

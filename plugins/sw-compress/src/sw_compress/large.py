@@ -409,7 +409,7 @@ class _Work:
     def _measured(self, choice: Choice, file: TiledFile) -> tuple[Choice, Basis | None]:
         """The choice with bytes as of what is written, and a basis of its higher SH coefficients."""
         with self.asked.stages.timed("search"):
-            sizes, basis = sizes_of(file.scene, file.importance, self.coder)
+            sizes, basis = sizes_of(file.scene, file.importance, self.coder, file.scene.degree)
         return choice.sized(sizes, self.sample.share), basis
 
     def _good(self, choice: Choice, error: float) -> Choice:
@@ -419,8 +419,8 @@ class _Work:
             with self.asked.stages.timed("search"):
                 part, curves = sample.search.part(count)
             choice = Choice(part, curves, choice.allocation)
-        finest = of_error(choice.curves, max(error - lost, (1 - MOST_LOST) * error) * sample.share)
-        return choice if finest.error > choice.allocation.error else replace(choice, allocation=finest)
+        rounding = max(error - lost, (1 - MOST_LOST) * error) * sample.share
+        return replace(choice, allocation=of_error(choice.curves, rounding))
 
     def _reduced(self, choice: Choice) -> TiledFile:
         """The whole scene with as small a share of its Gaussians as a choice has of the sample's; lets the scene go."""

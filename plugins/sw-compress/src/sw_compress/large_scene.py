@@ -153,6 +153,8 @@ class LargeScene:
             if seen is not None:
                 mine = seen[part]
                 rows, rest = rows[mine], rest[mine]
+            if not len(rows):
+                continue
             for some, higher in zip(rows.split(ROWS_AT_ONCE), rest.split(ROWS_AT_ONCE), strict=True):
                 known = [(light.sh_dc[some], higher), *(other(some, higher) for other in others)]
                 for colors, (dc, each) in zip(found, known, strict=True):
