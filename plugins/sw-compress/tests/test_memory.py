@@ -4,15 +4,18 @@ import weakref
 
 import pytest
 import torch
-from sw_compress import rounding
+from sw_compress import compress, rounding
+from sw_compress import source as sources
+from sw_compress.coders import Quantized
 from sw_compress.rounding import NAMES, Rounding, Steps
 from sw_compress.rows import IMPORTANCE
-from sw_gaussians import merging, simplifying
+from sw_gaussians import heap, merging, simplifying
 from sw_gaussians.simplifying import merged_by
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from splatwizard_core.api import GaussianModel
+from splatwizard_core.tooling import export_model, load_plugins
 
 COUNT = 3_000
 MODEL = 236
@@ -68,3 +71,22 @@ def test_merging_needs_what_is_left_about_twice(source):
     with Alive(source) as alive:
         merged_by(source, rows, COUNT // 2, getattr(source, IMPORTANCE)[rows])
     assert MODEL < alive.per_gaussian < 2.5 * MODEL
+
+
+def test_coefficients_of_the_source_lie_in_a_file_while_others_are_coded(ball, tmp_path, monkeypatch):
+    export_model(ball(400, degree=2), tmp_path / "ball.ply", load_plugins())
+    aside, coded = [], Quantized.encode
+
+    def watched(*args):
+        aside.append(sum(len(each) for each in heap.in_files()))
+        return coded(*args)
+
+    monkeypatch.setattr(Quantized, "encode", watched)
+    usual = compress(tmp_path / "ball.ply", size=6_000, views=6, device="cpu").data
+    monkeypatch.setattr(sources, "MANY", 100)
+    assert compress(tmp_path / "ball.ply", size=6_000, views=6, device="cpu").data == usual
+    half = len(aside) // 2
+    assert set(aside[:half]) == {0}
+    assert all(each >= 300 * 4 * 24 for each in aside[half:])
+    assert sum(len(each) for each in heap.in_files()) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["ball.ply"]

@@ -26,7 +26,7 @@ from sw_compress.reducing import Reduction
 from sw_compress.refining import Refined, refine
 from sw_compress.rows import IMPORTANCE, with_degree
 from sw_compress.search import Choice, Search, check_in_reach, for_quality, measured_again
-from sw_compress.source import Source, open_source
+from sw_compress.source import Source, lay_aside, open_source
 from sw_compress.stages import Stages, peak_bytes
 from sw_compress.targets import Target
 from sw_compress.views import Views, made_up_views, views_of_file
@@ -207,6 +207,8 @@ def _written(scene: str | os.PathLike[str] | GaussianModel, asked: _Asked, path:
     stages = asked.stages
     with stages.timed("read"):
         source = open_source(scene, asked.plugins, asked.device)
+    if not isinstance(scene, GaussianModel):  # that one is somebody else's
+        lay_aside(source.model, path.parent)
     target = Target.of(asked.size, asked.quality, asked.ratio, source.file_bytes)
     model = source.model if asked.sh_degree is None else with_degree(source.model, asked.sh_degree)
     coder = Quantized(asked.plugins, source.raster, precise=model.num_rows >= PRECISE_FROM)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from sw_compress.coders import POSITIONS
 from sw_compress.search import Choice, Search, for_size, too_small
+from sw_compress.stages import give_back
 from sw_compress.targets import LEAST_SHARE
 
 if TYPE_CHECKING:
@@ -54,6 +55,7 @@ class _File:
     def write(self, model: GaussianModel, levels: Levels) -> int:
         """Write it, if it does not hold just that; return its bytes."""
         if self._held is None or self._held[0] is not model or self._held[1] != levels:
+            give_back()
             with self.stages.timed("encode"):
                 self.bytes = self.coder.encode(model, levels, self.path)
             self._held, self.encodes = (model, dict(levels)), self.encodes + 1

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
+from sw_gaussians import heap
 from sw_gaussians.render_options import antialias_of, raster_of
 from sw_gaussians.surfels import refuse_surfels
 
@@ -19,6 +21,8 @@ if TYPE_CHECKING:
 
 FAINTEST = 1 / 255
 """Opacity below which a Gaussian is never drawn."""
+MANY = 100_000
+"""Gaussians of a scene whose copies are much of the memory that it takes."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +68,14 @@ def open_source(given: str | os.PathLike[str] | GaussianModel, plugins: PluginMa
             f"{path.name}: Gaussians of method '{reader.method}' depend on the camera: `sw bake` makes explicit ones"
         )
     return _source(path.name, bare(model), path.stat().st_size)
+
+
+def lay_aside(model: GaussianModel, folder: Path) -> None:
+    """Let higher SH coefficients of many Gaussians on a CPU lie in a file in a folder: most stages look at other copies
+    of them."""
+    if model.device.type == "cpu" and model.num_rows > MANY:
+        model.sh_rest.data = heap.in_file(model.sh_rest, folder)
+        heap.trim()
 
 
 def _source(name: str, model: GaussianModel, file_bytes: int | None) -> Source:
