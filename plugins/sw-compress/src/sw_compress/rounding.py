@@ -13,6 +13,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
+from sw_gaussians import heap
 from torch import Tensor
 
 from splatwizard_core.api import GaussianModel
@@ -121,6 +122,8 @@ class Rounding:
                 found[rows] = _complete(symbols * widths).float()
             else:
                 found[rows] = (symbols * widths).float().reshape(found[rows].shape)
+            if name == "rest":
+                heap.let_go()
         return found
 
     @torch.no_grad()
