@@ -70,7 +70,7 @@ def at_price(curves: Sequence[Curve], price: float) -> Allocation:
 
 
 def at_levels(curves: Sequence[Curve], levels: Mapping[str, float]) -> Allocation:
-    """What the curves say of levels of theirs."""
+    """Bytes and errors that the curves have at levels of theirs."""
     return _at(curves, [int(abs(curve.levels - levels[curve.name]).argmin()) for curve in curves])
 
 

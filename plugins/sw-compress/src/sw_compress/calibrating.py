@@ -168,7 +168,7 @@ def seen_by(camera: Camera, scene: LargeScene, rasterizer: Rasterizer) -> Tensor
 
 
 class _Drawn:
-    """What one camera sees of a model."""
+    """Gaussians of a model as one camera sees them."""
 
     def __init__(self, gaussians: GaussianInputs) -> None:
         self._gaussians, self.device = gaussians, gaussians.means.device

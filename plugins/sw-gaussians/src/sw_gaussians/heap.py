@@ -37,7 +37,7 @@ def let_go() -> None:
 
 
 def in_files() -> list[mmap.mmap]:
-    """What lies in files now."""
+    """Mappings of the files that numbers lie in now."""
     return list(_LIES_IN_FILES)
 
 
