@@ -16,7 +16,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PACKAGES := splatwizard-native splatwizard-core $(sort $(wildcard plugins/*))
 PROJECTS := $(addsuffix /pyproject.toml,$(PACKAGES))
-# Every training on a CPU uses them; compiled while pip is busy.
+# Every training on a CPU uses them; compiled while the environment is made.
 KERNELS := sw_rasterizers.native:MODULE,splatwizard_native.face_operations:POOL,splatwizard_native.fused.native:TRAINING
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 DEMO_OUT ?= out
@@ -25,14 +25,15 @@ TEST_JOBS ?= 2
 
 .PHONY: demo test test-wheels test-geometry test-ray test-browser test-interchange test-wasm decoder-hashes docs-site coverage lint format bench kernels docs clean
 
+# Many processes import the same packages: without their bytecode each would compile them anew, torch's for 3 s.
+demo test coverage: export PYTHONDONTWRITEBYTECODE =
+
 demo: $(VENV)/.ready
 	@tools/check-system compiler
 	$(BIN)/sw run --method 3dgs --rate r2,r3 --scene demo --out $(DEMO_OUT)
 	$(BIN)/sw run --method chimerags --scene demo --out $(DEMO_OUT)
 	$(BIN)/sw report $(DEMO_OUT)/demo
 
-# Hundreds of processes import our packages: without their bytecode each would compile them anew.
-test coverage: export PYTHONDONTWRITEBYTECODE =
 
 test: $(VENV)/.ready-dev
 	TEST_JOBS=$(TEST_JOBS) $(BIN)/python -m pytest $(PYTEST_ARGS)
@@ -111,14 +112,9 @@ docs: $(VENV)/.ready
 	$(BIN)/python tools/make_catalogue.py
 	$(BIN)/python tools/record_docs.py
 
-$(VENV)/bin/python:
+$(VENV)/.ready: constraints.txt $(PROJECTS)
 	@PYTHON=$(PYTHON) tools/check-system python
-	$(PYTHON) -m venv $(VENV)
-
-# hatchling first: with it at hand no package needs a build environment of its own.
-$(VENV)/.ready: $(VENV)/bin/python constraints.txt $(PROJECTS)
-	$(PIP) install -q -c constraints.txt hatchling editables filelock
-	$(BIN)/python tools/install_packages.py --constraint constraints.txt --kernels $(KERNELS) $(PACKAGES)
+	$(PYTHON) tools/install_packages.py --environment $(VENV) --constraint constraints.txt --kernels $(KERNELS) $(PACKAGES)
 	@touch $@
 
 $(VENV)/.ready-dev: $(VENV)/.ready requirements-dev.txt

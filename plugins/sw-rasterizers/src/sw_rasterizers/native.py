@@ -8,6 +8,9 @@ CFLAGS = ("-fno-math-errno", "-fno-trapping-math")
 """Neither changes a result: no caller reads errno, no one traps floating-point exceptions. Without them square roots
 and selections stay scalar. Nothing of -ffast-math is needed, the packs are vectors as written."""
 
+CXX17 = "-std=c++17"
+"""Overrides the -std=c++20 of all modules: the same code, and the standard headers are read in half the time."""
+
 MODULE_CUDA = NativeModule(
     name="sw_rasterizers_cuda",
     package="sw_rasterizers",
@@ -61,7 +64,7 @@ MODULE = NativeModule(
         "csrc/cpu/shared_colors.cpp",
     ),
     headers=("csrc/*.h", "csrc/cpu/*.h"),
-    cflags=CFLAGS,
+    cflags=(CXX17, *CFLAGS),
     without="rendering falls back to the pure-torch reference, some hundred times slower",
     face="csrc/cpu/face.h",
     cuda=MODULE_CUDA,
