@@ -34,7 +34,6 @@ demo: $(VENV)/.ready
 	$(BIN)/sw run --method chimerags --scene demo --out $(DEMO_OUT)
 	$(BIN)/sw report $(DEMO_OUT)/demo
 
-
 test: $(VENV)/.ready-dev
 	TEST_JOBS=$(TEST_JOBS) $(BIN)/python -m pytest $(PYTEST_ARGS)
 
