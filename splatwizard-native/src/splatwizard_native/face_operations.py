@@ -18,7 +18,6 @@ POOL = NativeModule(
     package="splatwizard_native",
     sources=("pool/pool.cpp",),
     headers=("pool/*.h",),
-    cflags=("-std=c++17",),  # the standard headers are read in half the time
     without="native code runs on one thread",
     face="pool/face.h",
 )

@@ -18,9 +18,8 @@ TRAINING = NativeModule(
     sources=("kernels/face.cpp",),
     kernels=("kernels/ssim.cpp", "kernels/adam.cpp"),
     headers=("kernels/*.h",),
-    # Without these two GCC keeps sqrt and division out of vector code. No -ffinite-math-only: a NaN in the image
-    # must reach the loss, where the trainer looks for it.
-    # C++17: the standard headers are read in half the time.
+    # C++17: its standard headers are read in half the time. Without the other two GCC keeps sqrt and division out of
+    # vector code. No -ffinite-math-only: a NaN in the image must reach the loss, where the trainer looks for it.
     cflags=("-std=c++17", "-fno-math-errno", "-fno-trapping-math"),
     without="loss and optimizer run on torch operations: the same numbers, the loss some six times slower",
     face="kernels/face.h",
