@@ -126,8 +126,8 @@ class Shape:
         t = np.full(near.shape, np.inf)
         index = np.flatnonzero(near)
         if len(index):
-            start = oc if oc.shape[1] == 1 else oc[:, index]
-            t[index] = self.hit(self.rotate_in(start), self.rotate_in(d[:, index]))
+            start = oc if oc.shape[1] == 1 else oc.take(index, axis=1)
+            t[index] = self.hit(self.rotate_in(start), self.rotate_in(d.take(index, axis=1)))
         return t
 
 
@@ -302,8 +302,8 @@ class Torus(Shape):
         found = np.full(t.shape, np.inf)
         alive = np.flatnonzero(t < end)
         for _ in range(64):
-            way = d[:, alive]
-            p = (o if o.shape[1] == 1 else o[:, alive]) + t[alive] * way
+            way = d.take(alive, axis=1)
+            p = (o if o.shape[1] == 1 else o.take(alive, axis=1)) + t[alive] * way
             rho = np.sqrt(p[0] * p[0] + p[1] * p[1])
             q = rho - self.ring
             from_circle = np.sqrt(q * q + p[2] * p[2])

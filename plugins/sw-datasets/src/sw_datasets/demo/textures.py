@@ -30,19 +30,25 @@ class Material:
     mirror: float = 0.0
 
 
+FACTORS = np.array([[0x8DA6B343], [0xD8163841], [0xCB1AB31F]], dtype=np.uint32)
+"""Of the hash of integer coordinates, for each axis."""
+
+
 def _lattice(ix: np.ndarray, iy: np.ndarray, iz: np.ndarray, seed: int) -> Vec:
     """Hash of integer coordinates -> [0,1)."""
-    with np.errstate(over="ignore"):
-        h = ix.astype(np.uint32) * np.uint32(0x8DA6B343)
-        h ^= iy.astype(np.uint32) * np.uint32(0xD8163841)
-        h ^= iz.astype(np.uint32) * np.uint32(0xCB1AB31F)
-        h ^= np.uint32((seed * 0x9E3779B9) & 0xFFFFFFFF)
-        h ^= h >> np.uint32(15)
-        h *= np.uint32(0x2C1B3C6D)
-        h ^= h >> np.uint32(12)
-        h *= np.uint32(0x297A2D39)
-        h ^= h >> np.uint32(15)
-    return cast(Vec, h / 4294967296.0)
+    x, y, z = np.stack([ix, iy, iz]).astype(np.uint32) * FACTORS
+    return _scrambled(x ^ y ^ z, seed)
+
+
+def _scrambled(h: np.ndarray, seed: int) -> Vec:
+    """[0,1) from the sum of the hash's axes, uint32, which is overwritten."""
+    h ^= np.uint32((seed * 0x9E3779B9) & 0xFFFFFFFF)
+    h ^= h >> np.uint32(15)
+    h *= np.uint32(0x2C1B3C6D)
+    h ^= h >> np.uint32(12)
+    h *= np.uint32(0x297A2D39)
+    h ^= h >> np.uint32(15)
+    return cast(Vec, h * 2.0**-32)
 
 
 def noise(p: Vec, seed: int) -> Vec:
@@ -50,13 +56,17 @@ def noise(p: Vec, seed: int) -> Vec:
     cell = np.floor(p)
     f = p - cell
     f = f * f * (3 - 2 * f)
-    x, y, z = cell.astype(np.int64)
+    rest = 1 - f
+    here = cell.astype(np.int64).astype(np.uint32) * FACTORS
+    (x0, y0, z0), (x1, y1, z1) = here, here + FACTORS
     planes = []
-    for dz in (0, 1):
-        low = _lattice(x, y, z + dz, seed) * (1 - f[0]) + _lattice(x + 1, y, z + dz, seed) * f[0]
-        high = _lattice(x, y + 1, z + dz, seed) * (1 - f[0]) + _lattice(x + 1, y + 1, z + dz, seed) * f[0]
-        planes.append(low * (1 - f[1]) + high * f[1])
-    return cast(Vec, planes[0] * (1 - f[2]) + planes[1] * f[2])
+    for z in (z0, z1):
+        rows = []
+        for y in (y0, y1):
+            yz = y ^ z
+            rows.append(_scrambled(x0 ^ yz, seed) * rest[0] + _scrambled(x1 ^ yz, seed) * f[0])
+        planes.append(rows[0] * rest[1] + rows[1] * f[1])
+    return cast(Vec, planes[0] * rest[2] + planes[1] * f[2])
 
 
 def smooth(x: Vec, low: float, high: float) -> Vec:
