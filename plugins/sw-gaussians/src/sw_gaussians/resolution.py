@@ -6,8 +6,9 @@ Source: DashGaussian (arXiv 2503.18402); `s` is the factor by which the side of 
 from __future__ import annotations
 
 import bisect
+import contextlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -22,6 +23,9 @@ BISECTION_STEPS = 24
 """Bisection steps of the search for a scale: finer than a pixel of any image."""
 FIRST_ENERGY_DIVISOR = 4.0
 """The first images hold 1/FIRST_ENERGY_DIVISOR of the sum of all spectral amplitudes."""
+
+FEW_PIXELS = 1 << 18
+"""Pixels of a picture up to which one thread is faster than several: they wait for each other, on shared cores long."""
 
 Rounding = Literal["real", "floor"]
 
@@ -118,13 +122,25 @@ def plan_of_views(
     sizes = sorted((view.camera.height * view.camera.width, view.camera.height, view.camera.width) for view in views)
     _, height, width = sizes[len(sizes) // 2]
     first, total = most, torch.zeros(height, width)
-    for view in views:
-        device = view.kept_on
-        picture = shrunk(view.image(background, device), height, width)
-        amplitude = amplitudes(picture)
-        first = min(first, first_scale(Spectrum(amplitude)))
-        total = total.to(device) + amplitude
+    with one_thread() if height * width <= FEW_PIXELS else contextlib.nullcontext():
+        for view in views:
+            device = view.kept_on
+            picture = shrunk(view.image(background, device), height, width)
+            amplitude = amplitudes(picture)
+            first = min(first, first_scale(Spectrum(amplitude)))
+            total = total.to(device) + amplitude
     return resolution_plan(first, Spectrum(total / len(views)), full_at=full_at)
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch compute on one thread inside the block."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def shrunk(image: Tensor, height: int, width: int) -> Tensor:
