@@ -1,9 +1,12 @@
 """Output of a step that runs in a process of its own."""
 
 import subprocess
+from pathlib import Path
 
 import pytest
+from forked_children import starting
 
+from splatwizard_core.errors import SplatwizardError
 from splatwizard_core.runs import fresh
 
 
@@ -15,3 +18,16 @@ def test_what_is_no_object_is_refused(monkeypatch: pytest.MonkeyPatch, printed: 
     monkeypatch.setattr(fresh.subprocess, "run", run)
     with pytest.raises(fresh.FreshProcessError, match="`sw decode` in a fresh process did not print a JSON object"):
         fresh.run_fresh(["decode"])
+
+
+def test_one_that_was_started_ahead_does_what_it_is_told(tmp_path: Path):
+    (tmp_path / "broken.swz").write_bytes(b"no such file")
+    failed = pytest.raises(SplatwizardError, match=r"`sw decode` in a fresh process failed \(status \d\): broken.swz")
+    with starting(), fresh.started_ahead() as ahead, failed:
+        fresh.run_fresh(["decode", str(tmp_path / "broken.swz")], ahead=ahead)
+
+
+def test_one_that_was_started_ahead_in_vain_ends_quietly(capfd: pytest.CaptureFixture[str]):
+    with starting(), fresh.started_ahead():
+        pass  # its end is waited for
+    assert capfd.readouterr() == ("", "")

@@ -93,6 +93,7 @@ def here(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) ->
 
     monkeypatch.setattr(run_module, "run_fresh", in_this_process)
     monkeypatch.setattr(run_module, "decode_fresh", decode)
+    monkeypatch.setattr(run_module, "started_ahead", contextlib.nullcontext)
 
 
 def test_every_file_of_a_run_may_meet_a_full_disk(

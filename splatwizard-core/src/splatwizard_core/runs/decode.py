@@ -129,24 +129,12 @@ def timed_decode(
             f"{path}: two decodes give different models; method '{reader.method}' is not deterministic"
         )
     return model, DecodingFacts(
-        method=reader.method,
-        method_version=reader.version,
-        digest=digest,
-        counts=model.counts(),
-        bytes=reader.size,
-        packets=reader.packets,
-        sections={"header": reader.header_bytes, **reader.sections},
-        raster=reader.raster,
-        decode_s=statistics.median(runs) if runs else first,
-        decode_runs_s=runs,
-        decode_spread=spread(runs) if len(runs) > 1 else None,
-        first_decode_s=first,
-        jit_s=loading_time(),
-        contended=contended,
-        peak_bytes=peak,
-        memory_kind=meter.kind,
-        device=str(device),
-    )
+        method=reader.method, method_version=reader.version, digest=digest, counts=model.counts(), bytes=reader.size,
+        packets=reader.packets, sections={"header": reader.header_bytes, **reader.sections}, raster=reader.raster,
+        decode_s=statistics.median(runs) if runs else first, decode_runs_s=runs,
+        decode_spread=spread(runs) if len(runs) > 1 else None, first_decode_s=first, jit_s=loading_time(),
+        contended=contended, peak_bytes=peak, memory_kind=meter.kind, device=str(device),
+    )  # fmt: skip
 
 
 def save_decoded(model: SplatModel, facts: DecodingFacts, path: Path, plugins: PluginManager) -> None:

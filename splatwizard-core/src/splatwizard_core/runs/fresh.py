@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from splatwizard_core.base.files import scratch_folder
 from splatwizard_core.errors import SplatwizardError, UserInputError
 from splatwizard_core.runs.facts import DecodingFacts
 
+CHILD = (sys.executable, "-m", "splatwizard_core.cli.fresh_child")
 HIDDEN = ("SPLATWIZARD_DATA", "SPLATWIZARD_TEST_DATA")
 
 
@@ -22,24 +24,46 @@ class FreshProcessError(SplatwizardError):
     """The other process failed; its own message stands on stderr already."""
 
 
-def run_fresh(arguments: Sequence[str], *, alone_in: Path | None = None, told: Collection[str] = ()) -> dict[str, Any]:
+@contextlib.contextmanager
+def started_ahead() -> Iterator[Callable[[Sequence[str]], subprocess.CompletedProcess[str]]]:
+    """Start a new interpreter, which imports torch while another step runs; `run_fresh` has it do one in its turn."""
+    theirs, ours = os.pipe()
+    shown = None if sys.stderr.isatty() else subprocess.PIPE
+    with subprocess.Popen([*CHILD, "--ahead"], stdin=theirs, stdout=subprocess.PIPE, stderr=shown, text=True) as child:
+        os.close(theirs)
+
+        def do(arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
+            os.write(ours, f"{json.dumps(arguments)}\n".encode())
+            printed, said = child.communicate()
+            return subprocess.CompletedProcess(arguments, child.returncode, printed, said)
+
+        try:
+            yield do
+        finally:
+            os.close(ours)  # which ends it, if it still runs
+
+
+def run_fresh(
+    arguments: Sequence[str], *, alone_in: Path | None = None, told: Collection[str] = (),
+    ahead: Callable[[Sequence[str]], subprocess.CompletedProcess[str]] | None = None,
+) -> dict[str, Any]:  # fmt: skip
     """Run `sw ARGUMENTS` in a new interpreter and return the JSON object that it prints.
 
     alone_in    working directory of one that must not find data sets: what names their folders is not in its
                 environment; None: it has ours
     told        lines that the user has read already: they are not repeated
+    ahead       has an interpreter do it that was started already, by `started_ahead`
 
     Its progress and messages go to our stderr. Raises UserInputError or FreshProcessError with its own message if
     it fails, KeyboardInterrupt if it was interrupted.
     """
     environment = {k: v for k, v in os.environ.items() if alone_in is None or k not in HIDDEN}
-    command = [sys.executable, "-m", "splatwizard_core.cli.fresh_child", *arguments]
     theirs, ours = os.pipe()  # it ends when we do: we hold the other end of its input, and the system closes it for us
     try:
         # The display of a terminal must reach it live; anything else is kept for the message.
-        done = subprocess.run(
-            command, cwd=alone_in, env=environment, stdin=theirs, stdout=subprocess.PIPE, text=True, check=False,
-            stderr=None if sys.stderr.isatty() else subprocess.PIPE,
+        done = ahead(arguments) if ahead is not None else subprocess.run(
+            [*CHILD, *arguments], cwd=alone_in, env=environment, stdin=theirs, stdout=subprocess.PIPE, text=True,
+            check=False, stderr=None if sys.stderr.isatty() else subprocess.PIPE,
         )  # fmt: skip
     finally:
         os.close(ours)

@@ -141,31 +141,18 @@ def measure(
         }  # fmt: skip
         speeds, memory = SpeedBlock.model_validate(told), MemoryBlock.model_validate(told)
     return Measurement(
-        dataset=scene.protocol.dataset,
-        scene=scene.name,
-        scene_warnings=list(scene.warnings),
-        scene_origin=scene.origin,
+        dataset=scene.protocol.dataset, scene=scene.name, scene_warnings=list(scene.warnings),
+        scene_origin=scene.origin, train_views=len(scene.train), test_views=len(views), views=result.views,
         protocol=ProtocolBlock.model_validate({"id": scene.protocol.id, **asdict(scene.protocol)}),
-        train_views=len(scene.train),
-        test_views=len(views),
-        views=result.views,
         metrics={name: MetricBlock.model_validate(asdict(metric)) for name, metric in results},
-        visible_gaussians=result.visible_gaussians,
-        drawn_gaussians=result.drawn_gaussians,
-        renders=result.renders,
+        visible_gaussians=result.visible_gaussians, drawn_gaussians=result.drawn_gaussians, renders=result.renders,
         geometry={name: dict(m.details) for name, m in of_model.items() if not m.per_view} or None,
-        training_psnr=of_training,
+        training_psnr=of_training, digest=model.digest(), counts=model.counts(), speed=speeds, memory=memory,
         unknown={f"metrics.{name}.mean": m.reason for name, m in results if m.reason is not None} | reasons,
-        digest=model.digest(),
-        counts=model.counts(),
-        speed=speeds,
-        memory=memory,
-        rasterizers=dict(rasterizer.choices),
-        raster=quality.raster_header(rasterizer.decided(options)),
-        environment=_environment(plugins, device, resolved.ppl.seed),
-        contended=contended,
+        rasterizers=dict(rasterizer.choices), raster=quality.raster_header(rasterizer.decided(options)),
+        environment=_environment(plugins, device, resolved.ppl.seed), contended=contended,
         flags=_flags(scene, result, meter, device_bound=device_bound, bad_rows=bad_rows, contended=bool(contended)),
-    )
+    )  # fmt: skip
 
 
 def _environment(plugins: PluginManager, device: torch.device, seed: int) -> dict[str, Any]:

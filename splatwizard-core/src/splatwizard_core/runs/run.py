@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 from datetime import datetime, timezone
 from pathlib import Path
+from typing import Any
 
 from splatwizard_core.base.files import file_sha256
 from splatwizard_core.base.progress import counted
@@ -30,11 +31,12 @@ from splatwizard_core.runs.facts import (
     Recorded,
     TrainingFacts,
 )
-from splatwizard_core.runs.fresh import decode_fresh, run_fresh
+from splatwizard_core.runs.fresh import decode_fresh, run_fresh, started_ahead
 from splatwizard_core.runs.identity import training_key
 from splatwizard_core.runs.phases import phases_of_run
 from splatwizard_core.runs.session import Session, TrainedModel
 from splatwizard_core.runs.training import train
+from splatwizard_native import available_cores
 
 MEASURING = 2  # raised when `sw decode` and `sw eval` come to report more: a step that reported less is done again
 
@@ -45,7 +47,8 @@ def run(session: Session, request: RunRequest) -> tuple[schema.Record, Path]:
     Raises RunLockedError if another process writes there, and whatever a step raises.
     """
     resolved = request.resolved
-    with held_directory(session, request) as directory:
+    with held_directory(session, request) as directory, contextlib.ExitStack() as stack:
+        ahead: list[Any] = []  # of the evaluating process, which imports while the decoding one does
         steps, encoded = StepLog(directory), directory / ENCODED
         train_key, repeats = training_key(session, resolved), max(REPEATS, request.repeats)
 
@@ -56,6 +59,8 @@ def run(session: Session, request: RunRequest) -> tuple[schema.Record, Path]:
             return facts
 
         def decode_it() -> DecodingFacts:
+            if available_cores() > 1:
+                ahead.append(stack.enter_context(started_ahead()))
             facts = decode_fresh(encoded, str(session.device), repeats=repeats, threads=resolved.ppl.threads)
             session.say(f"decoded in a fresh process: {facts.decode_s:.2f} s, {counted(facts.counts)}")
             return facts
@@ -65,7 +70,7 @@ def run(session: Session, request: RunRequest) -> tuple[schema.Record, Path]:
             arguments += ["--renders", str(directory / RENDERS), "--repeats", str(request.repeats), "--quiet", "--json"]
             arguments += ["--prefixes", *["--geometry"] * request.geometry]
             told = [*session.told, *(f"WARNING: {line}" for line in WARNED)]
-            facts = Measurement.model_validate(run_fresh(arguments, told=told))
+            facts = Measurement.model_validate(run_fresh(arguments, told=told, ahead=ahead.pop() if ahead else None))
             return facts.model_copy(update={"asked": asked})
 
         encoding = steps.once(

@@ -242,16 +242,10 @@ def _train_stages(
     figures, rasterizers = outcome.figures, plugins.rasterizers
     served = [rasterizers.entry(name) for name in figures.rasterizers.values() if name in rasterizers]
     return outcome.model, TrainingFacts(
-        **dict(LoopFigures.model_validate(figures.model_dump())),
-        train_s=figures.train_s,
-        steps=figures.steps,
+        **dict(LoopFigures.model_validate(figures.model_dump())), train_s=figures.train_s, steps=figures.steps,
         stages=[StageBlock(name=name, seconds=seconds) for name, seconds in figures.stage_seconds.items()],
-        pretraining=before,
-        trained_in=resolved.rate,
-        plan=outcome.plan,
-        rasterizers=figures.rasterizers,
-        phases=parts.phases(figures.provided),
+        pretraining=before, trained_in=resolved.rate, plan=outcome.plan, rasterizers=figures.rasterizers,
+        phases=parts.phases(figures.provided), made_by=made_by(plugins, [*loaded, *served]),
         raster=raster_header(options) if figures.steps else kept_header(outcome.model, options, ppl.raster.options),
-        made_by=made_by(plugins, [*loaded, *served]),
         contended=contention("train", cores),
-    )
+    )  # fmt: skip
