@@ -87,7 +87,7 @@ def test_a_room_is_small_enough_to_follow(room):
 
 def test_core_and_native_together_stay_small():
     lines = lines_in(files_of(CORE)) + lines_in(files_of(NATIVE))
-    assert lines < 16_825, f"core and native have {lines:,} lines"
+    assert lines < 16_835, f"core and native have {lines:,} lines"
 
 
 @pytest.mark.parametrize("room", sorted(ROOMS))

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 import pytest
 import torch
 
 from splatwizard_core.errors import SceneError
+from splatwizard_core.scene import images
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.images import check_pictures, decode_all, decoded_ahead
 from splatwizard_core.scene.scene import View
@@ -45,6 +48,19 @@ def test_decode_all_decodes_every_view_once():
     assert pictures.decoded == [1] * 5
     assert [int(view.pixels[0, 0, 0]) for view in pictures.views] == [0, 1, 2, 3, 4]
     assert pictures.masks == 0
+
+
+@pytest.mark.parametrize("decode", [decode_all, check_pictures, lambda views: list(decoded_ahead(views))])
+def test_two_pictures_are_decoded_at_a_time(monkeypatch, decode):
+    """Each waits for the other: one after the other none would come."""
+    monkeypatch.setattr(images, "available_cores", lambda: 2)
+    both = threading.Barrier(2, timeout=20)
+
+    def load() -> np.ndarray:
+        both.wait()
+        return np.zeros((6, 8, 3), np.uint8)
+
+    decode([View(CAMERA, name, load) for name in "ab"])
 
 
 @pytest.mark.filterwarnings("error")

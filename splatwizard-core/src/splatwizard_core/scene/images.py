@@ -16,7 +16,7 @@ from splatwizard_native import available_cores
 
 def decode_all(views: Iterable[View]) -> None:
     """Decode the pictures of all views now, on several threads; afterwards `view.pixels` costs nothing."""
-    _each("read pictures", views, lambda view: view.pixels)
+    _each("read pictures", views, lambda view: vars(view).update(pixels=view.decoded()))
 
 
 def check_pictures(views: Iterable[View]) -> None:
@@ -60,9 +60,10 @@ def keep_pictures(views: Iterable[View], device: torch.device | str) -> bool:
 
 
 def _decoded(view: View) -> View:
-    found = view if "pixels" in vars(view) else replace(view)
-    _ = found.pixels
-    return found
+    if "pixels" not in vars(view):
+        view = replace(view)
+        vars(view).update(pixels=view.decoded())
+    return view
 
 
 def _threads() -> int:

@@ -33,6 +33,10 @@ class View:
     @cached_property
     def pixels(self) -> Tensor:
         """uint8 [3,H,W] or [4,H,W] (RGBA, straight alpha), host memory, decoded once."""
+        return self.decoded()
+
+    def decoded(self) -> Tensor:
+        """Return `pixels`, decoded anew; before Python 3.12 a cached property lets one thread at a time in."""
         if self.load is None:
             raise ValueError(f"view '{self.name}' has no picture")
         return torch.from_numpy(np.array(self.load().transpose(2, 0, 1), order="C"))  # a copy: what Pillow has is fixed

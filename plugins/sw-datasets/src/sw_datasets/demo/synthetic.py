@@ -15,6 +15,7 @@ from torch import Tensor
 
 from splatwizard_core.api import Camera, PointCloud, Protocol, Scene, View, stream
 from sw_datasets.assemble import assemble_scene
+from sw_datasets.demo.beside import drawn_beside
 from sw_datasets.demo.picture_cache import kept_or_drawn, picture_key
 from sw_datasets.demo.raycast import Solid, World, depth_map, draw, eye_of, normal_map
 from sw_datasets.demo.shapes import Box, Cylinder, Sphere, Torus, Vec, dot, rotation_x, rotation_z, uniform
@@ -223,7 +224,8 @@ def _picture(world: World, seed: int, camera: Camera, samples: int, background: 
     """Draw a camera's picture of `build_world(seed)`, or read it, if it was drawn before."""
     key = picture_key(stream(seed, "world").get_state().numpy().tobytes(), camera, samples, background)
     shape = (camera.height, camera.width, 3)
-    return kept_or_drawn(key, shape, partial(draw, world, camera, samples=samples, background=background))
+    drawing = partial(draw, world, camera, samples=samples, background=background)
+    return kept_or_drawn(key, shape, partial(drawn_beside, drawing, camera.width * camera.height * samples**2))
 
 
 def make_scene(
