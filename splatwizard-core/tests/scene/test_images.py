@@ -54,7 +54,7 @@ def test_decode_all_decodes_every_view_once():
 def test_two_pictures_are_decoded_at_a_time(monkeypatch, decode):
     """Each waits for the other: one after the other none would come."""
     monkeypatch.setattr(images, "available_cores", lambda: 2)
-    both = threading.Barrier(2, timeout=20)
+    both = threading.Barrier(2, timeout=60)
 
     def load() -> np.ndarray:
         both.wait()
