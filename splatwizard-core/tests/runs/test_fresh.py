@@ -1,6 +1,9 @@
 """Output of a step that runs in a process of its own."""
 
+import os
+import signal
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -31,3 +34,25 @@ def test_one_that_was_started_ahead_in_vain_ends_quietly(capfd: pytest.CaptureFi
     with starting(), fresh.started_ahead():
         pass  # its end is waited for
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals are not sent there")
+def test_one_that_was_started_ahead_is_interrupted_without_a_traceback():
+    command = [sys.executable, "-X", "importtime", *fresh.CHILD[1:], "--ahead"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as child:
+        assert child.stderr is not None
+        for line in child.stderr:  # it says so once it has imported torch, and waits
+            if line.endswith("| torch\n"):
+                break
+        child.send_signal(signal.SIGINT)
+        assert "Traceback" not in child.stderr.read()
+    assert child.returncode == -signal.SIGINT
+
+
+@pytest.mark.skipif(not hasattr(os, "waitid"), reason="the system does not tell that it has ended")
+def test_one_that_was_started_ahead_and_died_is_told(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(fresh, "CHILD", (sys.executable, "-c", "raise SystemExit(3)"))
+    failed = pytest.raises(fresh.FreshProcessError, match=r"failed \(status 3\): see above")
+    with starting(), fresh.started_ahead() as ahead, failed:
+        os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOWAIT)
+        fresh.run_fresh(["eval"], ahead=ahead)

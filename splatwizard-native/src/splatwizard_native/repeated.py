@@ -43,8 +43,8 @@ class Repeated(threading.local):
             if value is not None and type(value) not in PLAIN:
                 value = tuple([x.data_ptr() for x in value]) if type(value) is list else value.data_ptr()
             if name not in values or values[name] != value:
-                values[name] = value
                 setattr(call, name, value)
+                values[name] = value
         if call.device >= 0:
             call.stream = torch._C._cuda_getCurrentRawStream(call.device)
         if self._function(self._reference) != 0:

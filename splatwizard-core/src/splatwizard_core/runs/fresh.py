@@ -33,7 +33,8 @@ def started_ahead() -> Iterator[Callable[[Sequence[str]], subprocess.CompletedPr
         os.close(theirs)
 
         def do(arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
-            os.write(ours, f"{json.dumps(arguments)}\n".encode())
+            with contextlib.suppress(BrokenPipeError):  # it has ended already, as its status tells
+                os.write(ours, f"{json.dumps(arguments)}\n".encode())
             printed, said = child.communicate()
             return subprocess.CompletedProcess(arguments, child.returncode, printed, said)
 
@@ -78,11 +79,9 @@ def run_fresh(
         raise kind(f"`{name}` in a fresh process failed (status {done.returncode}): {last}")
     if said:
         print(said, file=sys.stderr, flush=True)
-    try:
+    with contextlib.suppress(ValueError):
         if isinstance(content := json.loads(done.stdout), dict):
             return content
-    except ValueError:
-        pass
     raise FreshProcessError(f"`{name}` in a fresh process did not print a JSON object: {done.stdout[:200]!r}")
 
 
