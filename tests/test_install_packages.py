@@ -36,9 +36,14 @@ def test_without_kernels_nothing_is_started(tool, monkeypatch):
         pass
 
 
-def test_an_environment_that_is_there_is_taken(tool, tmp_path, monkeypatch):
-    python = tmp_path / "bin" / "python"
+def test_an_environment_that_is_there_is_taken_and_half_of_one_is_made_whole(tool, tmp_path, monkeypatch):
+    commands: list[list[str]] = []
+    monkeypatch.setattr(tool.subprocess, "run", lambda command, **options: commands.append(command))
+    python, pip = tmp_path / "bin" / "python", tmp_path / "bin" / "pip"
     python.parent.mkdir()
     python.touch()
-    monkeypatch.setattr(tool.subprocess, "run", None)
     assert tool.environment(tmp_path) == str(python)
+    assert [command[1:] for command in commands] == [["-m", "venv", str(tmp_path)]]
+    pip.touch()
+    assert tool.environment(tmp_path) == str(python)
+    assert len(commands) == 1
