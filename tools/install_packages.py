@@ -71,7 +71,7 @@ def main() -> None:
 def environment(folder: Path) -> str:
     """Return the Python of a virtual environment, made if it is not there."""
     python = folder / "bin" / "python"
-    if not (python.exists() and python.with_name("pip").exists()):  # pip comes last: making it may have been interrupted
+    if not (python.exists() and python.with_name("pip").exists()):  # pip comes last, unless that was interrupted
         subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
     return str(python)
 
