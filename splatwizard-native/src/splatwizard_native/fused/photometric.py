@@ -72,7 +72,7 @@ class _Photometric(torch.autograd.Function):  # (learns, x, y, lambda, padding) 
         *found, grad = photometric_gradient(*given, learns=learns)  # type: ignore[misc]
         ctx.save_for_backward(grad)
         ctx.mark_non_differentiable(*found[1:])
-        return tuple(found)
+        return found[0].clone(), *found[1:]  # as a view of all three it could not be added to in place
 
     @staticmethod
     @once_differentiable

@@ -19,7 +19,7 @@ def accumulate(model: GaussianModel, gradients: Tensor, radii: Tensor) -> bool:
     fits = _fits_kernel(gradients, radii, sums) and GAUSSIANS.has_cuda()
     if fits:
         rows, tensors = radii.shape[0], (gradients, radii, *sums)
-        form = gradients.dim(), *((t.shape[0] == rows, t.get_device()) for t in tensors)
+        form = gradients.shape[1:], *((t.shape[0] == rows, t.get_device()) for t in tensors)
         _VIEW(
             dict, form, gradients=gradients, radii=radii, rows=rows, grad_accum=sums[0], denom=sums[1],
             max_radii=sums[2],
