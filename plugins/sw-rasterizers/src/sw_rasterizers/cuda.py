@@ -224,7 +224,10 @@ def project_backward(
 
     operation = _once(cuda_face.project_backward)
     if again is not None:  # with other updates, other fields are set
-        operation = again.setdefault(" ".join(("of", *done)), Repeated(cuda_face, "project_backward"))
+        kind = " ".join(("of", *done))
+        if kind not in again:
+            again[kind] = Repeated(cuda_face, "project_backward")
+        operation = again[kind]
     found = operation(
         fixed, **_rows(means.shape[0], again), **{name: x for name, x in tensors.items() if x is not None},
         camera=tuple(call.camera), drawn=drawn, rows=rows, maps=maps,
