@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -37,7 +38,10 @@ def test_what_was_looked_at_leaves_memory_again():
     assert of_files() < least + 0.1 * found.nbytes
 
 
-def test_where_there_is_no_room_they_stay_in_memory(tmp_path):
+def test_where_there_is_no_room_they_stay_in_memory(tmp_path, monkeypatch):
     values = torch.ones(3)
+    monkeypatch.setattr(heap.shutil, "disk_usage", lambda folder: SimpleNamespace(free=2 * values.nbytes - 1))
+    assert heap.in_file(values, tmp_path).data_ptr() == values.data_ptr()
+    monkeypatch.undo()
     assert heap.in_file(values, tmp_path / "none").data_ptr() == values.data_ptr()
     assert heap.in_file(values[:0]).numel() == 0

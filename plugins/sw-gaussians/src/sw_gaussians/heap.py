@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import mmap
+import shutil
 import tempfile
 import weakref
 from pathlib import Path
@@ -51,6 +52,8 @@ def in_file(values: Tensor, folder: Path | None = None) -> Tensor:
     if values.device.type != "cpu" or not values.numel() or not hasattr(mmap, "MADV_DONTNEED"):
         return values
     try:
+        if shutil.disk_usage(folder or tempfile.gettempdir()).free < 2 * values.nbytes:
+            return values  # what is written into the folder needs room, too
         with tempfile.TemporaryFile(dir=folder, prefix=".sw-") as file:
             file.write(values.numpy().data)
             file.flush()
