@@ -88,7 +88,7 @@ Again = dict[str, Repeated]
 
 def again() -> Again:
     """Return what a first drawing fills for those that are like it."""
-    return {name: Repeated(cuda_face, name) for name in ("render", "blend_backward")}
+    return {name: Repeated(cuda_face, name) for name in ("render", "blend_backward", "project_backward")}
 
 
 def draw(picture: Picture, tensors: Tensors, again: Again | None = None) -> Drawn:
@@ -222,14 +222,8 @@ def project_backward(
         settings = {name: x for name, x in picture.settings().items() if name not in unwanted}
         return {**settings, **more}
 
-    operation = _once(cuda_face.project_backward)
-    if again is not None:  # with other updates, other fields are set
-        kind = " ".join(("of", *done))
-        if kind not in again:
-            again[kind] = Repeated(cuda_face, "project_backward")
-        operation = again[kind]
-    found = operation(
-        fixed, **_rows(means.shape[0], again), **{name: x for name, x in tensors.items() if x is not None},
+    found = (_once(cuda_face.project_backward) if again is None else again["project_backward"])(
+        fixed, tuple(done), **_rows(means.shape[0], again), **{name: x for name, x in tensors.items() if x is not None},
         camera=tuple(call.camera), drawn=drawn, rows=rows, maps=maps,
         **_adam("dc", done.get("sh_dc")), **_adam("rest", done.get("sh_rest")),
         **{f"of_{name}": x.data_ptr() for name, x in made.items()},
@@ -269,7 +263,7 @@ def visible_radii(call: Call, geometry: Tensors) -> Tensor:
 
 def _once(operation: Callable[..., Any]) -> Callable[..., Any]:
     """Return an operation as something that is called as `Repeated` is."""
-    return lambda fixed, **changed: operation(**fixed(), **changed)
+    return lambda fixed, form=None, /, **changed: operation(**fixed(), **changed)
 
 
 def _rows(count: int, again: Again | None) -> dict[str, int]:

@@ -34,11 +34,10 @@ class _Last(NamedTuple):
 
 
 class _Kept(threading.local):
-    """The last calls of a thread, whose structs are its own."""
+    """The last drawing of a thread, whose structs are its own."""
 
     def __init__(self) -> None:
         self.drawn: _Last | None = None
-        self.filtered: tuple[list[Any], Repeated] | None = None
 
 
 class Unrecorded:
@@ -46,7 +45,7 @@ class Unrecorded:
 
     def __init__(self, info: RasterizerInfo) -> None:
         self._info = info
-        self._kept = _Kept()
+        self._kept, self._radii = _Kept(), Repeated(cuda_face, "visible_radii")
 
     def draw(
         self,
@@ -88,15 +87,15 @@ class Unrecorded:
         rows = g.means.shape[0]
         means, scales, quats = (None if x is None else x.contiguous() for x in (g.means, g.scales, g.quats))
         form = [_kind(x, rows) for x in (means, scales, quats)]
-        last = self._kept.filtered
-        if last is None or last[0] != form:
+        radii = g.means.new_empty(rows, dtype=torch.int32)
+
+        def checked() -> dict[str, Any]:
             self._info.check_geometry(g)
             cuda.check()
-            last = self._kept.filtered = form, Repeated(cuda_face, "visible_radii")
-        radii = g.means.new_empty(rows, dtype=torch.int32)
-        last[1](
-            lambda: {"scale_modifier": 1.0, "eps2d": RasterOptions.eps2d, "flags": 0},
-            means=means, scales=scales, quats=quats, radii=radii, count=rows, shapes=rows,
+            return {"scale_modifier": 1.0, "eps2d": RasterOptions.eps2d, "flags": 0}
+
+        self._radii(
+            checked, form, means=means, scales=scales, quats=quats, radii=radii, count=rows, shapes=rows,
             camera=tuple(camera_numbers(cam)), width=cam.width, height=cam.height,
         )  # fmt: skip
         return radii
