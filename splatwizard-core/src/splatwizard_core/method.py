@@ -100,7 +100,7 @@ def create_method(
     if preset not in cls.PRESETS:
         raise ConfigError(f"'{name}' has no preset '{preset}'; it has {', '.join(cls.PRESETS)}", key="preset")
     borrowed = {k: v for k, v in cls.PRESETS[preset].items() if not is_beside_method(cls.Config, k)}
-    values = {**borrowed, **dotted(config or {}, "")}
+    values = {**borrowed, **dotted(config or {})}
     usual, source = cls.Config(), f"config of '{name}'"
     asked = apply_overrides(usual, values, source=source, known=usual.settings_keys(plugins))
     return cls(plugins, asked.completed(plugins, dict.fromkeys(values, source)))

@@ -18,7 +18,7 @@ from splatwizard_core.training.keys import dotted
 
 def _choices(options: dict[str, Any], **given: Any) -> tooling.Choices:
     known = {each.name: options.pop(each.name) for each in fields(tooling.Choices) if each.name in options}
-    return tooling.Choices(**given, **known, below=dotted(options, ""))
+    return tooling.Choices(**given, **known, below=dotted(options))
 
 
 def _training(method: str, scene: str | None, out: str | Path, options: dict[str, Any]) -> Any:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import contextlib
 from typing import TYPE_CHECKING, Any
 
-from sw_gaussians.older_keys import flattened
-
 from splatwizard_core.api import ConfigError, apply_overrides
+from splatwizard_core.tooling import dotted
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Method, OptimizationParams
@@ -90,7 +89,7 @@ def between(
     whole   that share for whole numbers; None: the same
     """
     found: dict[str, Any] = {}
-    first, second = flattened(a.model_dump()), flattened(b.model_dump())
+    first, second = dotted(a.model_dump()), dotted(b.model_dump())
     if first.keys() != second.keys():
         return None
     for key, high in second.items():
@@ -116,4 +115,4 @@ def _is_number(value: Any) -> bool:
 
 
 def _value(config: OptimizationParams, key: str) -> Any:
-    return flattened(config.model_dump()).get(key)
+    return dotted(config.model_dump()).get(key)

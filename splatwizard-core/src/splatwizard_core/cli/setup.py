@@ -153,7 +153,7 @@ class Choices:
         for key in (k for k in values if k in OptimizationParams.model_fields):
             known = ", ".join(sorted({*SCENE_KEYS, *block_keys(PipelineParams)}))
             raise ConfigError(f"key '{key}' in --set is of no use here: one of {known}", key=key)
-        from_file = dotted({"metrics": tables.pop("metrics", {})}, "")
+        from_file = dotted({"metrics": tables.pop("metrics", {})})
         for key, value in flatten(PipelineParams, tables).items():
             if key not in RESERVED and (key in SCENE_KEYS or field_at(PipelineParams, key) is not None):
                 from_file[key] = value
@@ -213,7 +213,7 @@ class Choices:
         keys = tuple(
             f"{k}." for point in method.RATES.values() for k in point if field_at(method.Config, k) is not None
         )
-        found = dotted(wanted.config.model_dump(), "").items()
+        found = dotted(wanted.config.model_dump()).items()
         return replace(chosen, rate=None, below={k: v for k, v in found if f"{k}.".startswith(keys)})
 
 
@@ -222,7 +222,7 @@ def tell_data_set_values(found: Sequence[ResolvedConfig], tell: Callable[[str], 
     from splatwizard_core.training.keys import dotted
 
     for each in reversed({each.method: each for each in reversed(found)}.values()):
-        values = dotted(each.config.model_dump() | each.scene_options, "") | dotted(each.pretrained, "pretrained.")
+        values = dotted(each.config.model_dump() | each.scene_options) | dotted(each.pretrained, "pretrained.")
         told = [f"{k} = {values[k]}" for k, source in each.provenance.items() if source.startswith("data set ")]
         if told:
             tell(f"{each.method}, by data set: {', '.join(told)}")

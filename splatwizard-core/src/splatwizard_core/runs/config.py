@@ -291,7 +291,7 @@ def resolve(
     tables = read_config_file(config_file) if config_file is not None else {}
     whole, said = set(tables) >= OF_RUN, {name: tables.pop(name) for name in RESERVED if name in tables}
     _check_names(said, config_file, method=method.name, preset=preset, rate=rate, scene=scene)
-    tables |= dotted({name: tables.pop(name) for name in TABLES if name in tables}, "")
+    tables |= dotted({name: tables.pop(name) for name in TABLES if name in tables})
     scene_spec = scene or said.get("scene") or plugins.datasets.default or ""
     procedural = is_procedural(plugins.datasets, scene_spec.partition(":")[0])
     preset = preset or said.get("preset") or ("quick" if procedural else "paper")

@@ -106,7 +106,7 @@ def stored_config(plugins: PluginManager, stored: Mapping[str, Any], *, absent: 
     options = SceneOptions(**SceneParams.model_validate(scene).model_dump(), seed=run.seed)
     return ResolvedConfig(
         cls.name, stored.get("preset", "paper"), stored.get("rate", cls.DEFAULT_RATE), "", config, run, options,
-        given_values(config, plugins), {}, stored.get("init", ""), dotted(stored.get("pretrained", {}), ""),
+        given_values(config, plugins), {}, stored.get("init", ""), dotted(stored.get("pretrained", {})),
     )  # fmt: skip
 
 

@@ -274,7 +274,7 @@ def normalised(identity: Mapping[str, Any]) -> dict[str, Any]:
 
 def differences(checkpoint: Checkpoint, identity: Mapping[str, Any], plan: Sequence[str], extent: float) -> list[str]:
     """Return a line for each difference between a checkpoint's identity, plan or extent and this run's."""
-    old, new = dotted(checkpoint.identity, ""), dotted(normalised(identity), "")
+    old, new = dotted(checkpoint.identity), dotted(normalised(identity))
     lines = []
     for key in sorted(old.keys() | new.keys()):
         before, now = old.get(key, "absent"), new.get(key, "absent")
